@@ -16,11 +16,12 @@ from benchmarks.accuracy import pose_error
 from benchmarks.rows import Row, once, save
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.drift import check
-from evercal.calibration.from_images import Images, calibrate
+from evercal.calibration.from_images import calibrate
+from evercal.calibration.image_source import Images
 from evercal.errors import InputError
 from evercal.evaluation.metrics import CHI2_6
 from evercal.geometry import SE3
-from evercal.learning.scene import LearnReport
+from evercal.learning.report import LearnReport
 from evercal.localization.localizer import Localizer
 from evercal.map import Map
 from evercal.recordings import Recording, load_recording

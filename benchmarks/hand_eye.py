@@ -154,7 +154,9 @@ def trials(setting: Setting, count: int, first_seed: int = 0) -> dict[str, float
         left_out = tuple(i for i, image in enumerate(result.images) if not image.used)
         named.append(left_out == drawn.spoiled)
         if setting.scale is not None:
-            scale.append(100 * abs(result.checks["scale"] / setting.scale - 1))
+            scale.append(
+                100 * abs(result.checks.to_dict()["scale"] / setting.scale - 1)
+            )
     return {
         "median mm": float(np.median(mm)),
         "median deg": float(np.median(deg)),

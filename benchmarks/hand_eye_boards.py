@@ -171,7 +171,9 @@ def measure(name: str, count: int, references: int) -> Row:
         ms.append(1000 * (time.process_time() - began))
         truth = drawn.parent_from_camera
         squared.append(result.uncertain_pose.squared_mahalanobis(truth))
-        flagged.append(any("than stated" in text for text in result.checks["warnings"]))
+        flagged.append(
+            any("than stated" in text for text in result.checks.to_dict()["warnings"])
+        )
         estimates = {"evercal": result.parent_from_child}
         if seed < references and corners is not None:
             start = result.parent_from_child

@@ -13,11 +13,12 @@ from tyro.conf import Positional
 
 from benchmarks.accuracy import accuracy_row
 from benchmarks.rows import Row, mean_row, save
-from evercal.calibration.from_images import Images, calibrate
+from evercal.calibration.from_images import calibrate
+from evercal.calibration.image_source import Images
 from evercal.errors import InputError
 from evercal.evaluation import evaluate
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.learning.scene import LearnReport
+from evercal.learning.report import LearnReport
 from evercal.localization.localizer import Localizer
 from evercal.localization.options import LocalizeOptions
 from evercal.map import Map

@@ -363,7 +363,7 @@ def measure(name: str, draws: int) -> Row:
             safe = True
             counts["refused"] += 1
         else:
-            checks = answer.checks
+            checks = answer.checks.to_dict()
             left_out = [i.name for i in answer.images if not i.used]
             notes = [*checks["warnings"], f"left out: {', '.join(left_out)}"]
             notes += [f"corners: {', '.join(checks.get('corners_left_out', ()))}"]

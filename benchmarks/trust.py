@@ -26,7 +26,8 @@ from benchmarks.calibration import (
 )
 from benchmarks.lenses import LENSES, ROLLS_DEG, View, rolled
 from benchmarks.rows import Row, once, save, show
-from evercal.calibration.from_images import Images, calibrate
+from evercal.calibration.from_images import calibrate
+from evercal.calibration.image_source import Images
 from evercal.continual.benchmark.results import Table
 from evercal.errors import InputError
 from evercal.evaluation.metrics import CHI2_6

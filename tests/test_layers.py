@@ -39,7 +39,16 @@ ORDER = (
     "cli",
 )
 """Folders, and the module map.py."""
-FOR_ALL = ("bounds", "choices", "cluster", "errors", "processes", "progress", "typing")
+FOR_ALL = (
+    "bounds",
+    "choices",
+    "cluster",
+    "errors",
+    "notebook",
+    "processes",
+    "progress",
+    "typing",
+)
 FACES = ("__init__", "__main__")
 """Modules of the root that may import everything."""
 PRODUCT = ORDER[: ORDER.index("simulation")]

@@ -25,7 +25,8 @@ import yaml
 from scipy.io import savemat
 
 from evercal.calibration.boards.board_poses import read_board_poses
-from evercal.calibration.calibration import read_calibration, read_transform
+from evercal.calibration.calibration import read_calibration
+from evercal.calibration.transform_file import read_transform
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.map import Map

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from docs._site.notebooks import NOTEBOOKS, Step, notebook_of, parts
-from evercal.calibration.calibration import read_transform
+from evercal.calibration.transform_file import read_transform
 from evercal.cli import main
 from evercal.geometry import SE3, pose_distance_mm_deg
 from evercal.recordings import Recording, generic, samples

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from evercal.geometry import SE3 as SE3
     from evercal.geometry import Camera as Camera
     from evercal.geometry import UncertainPose as UncertainPose
-    from evercal.learning.scene import LearnReport as LearnReport
+    from evercal.learning.report import LearnReport as LearnReport
     from evercal.localization.estimate import PoseEstimate as PoseEstimate
     from evercal.localization.options import LocalizeOptions as LocalizeOptions
     from evercal.map import Map as Map
@@ -64,7 +64,7 @@ _PUBLIC = {
     "Client": "evercal.service.client",
     "Frame": "evercal.recordings",
     "InputError": "evercal.errors",
-    "LearnReport": "evercal.learning.scene",
+    "LearnReport": "evercal.learning.report",
     "LocalizeOptions": "evercal.localization.options",
     "Map": "evercal.map",
     "MapOptions": "evercal.mapping.build",

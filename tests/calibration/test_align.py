@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.drift import check
-from evercal.calibration.from_images import Images, calibrate
+from evercal.calibration.from_images import calibrate
 from evercal.calibration.from_map.align import (
     MapAlignment,
     Picks,
@@ -18,6 +18,7 @@ from evercal.calibration.from_map.align import (
     align_by_points,
     fit_picks,
 )
+from evercal.calibration.image_source import Images
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
 from evercal.localization.localizer import Localizer

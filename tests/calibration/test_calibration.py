@@ -14,6 +14,7 @@ from evercal.calibration.calibration import (
     JointOffset,
     read_calibration,
 )
+from evercal.calibration.checks import checks_of
 from evercal.calibration.verdict import TIERS, expected_error, tier, verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
@@ -107,7 +108,11 @@ def calibration(mm: float, deg: float, **checks: float) -> Calibration:
     """A calibration with this root mean square error in space."""
     axes = np.repeat([mm / 1000, np.deg2rad(deg)], 3) / np.sqrt(3)
     return Calibration(
-        "eye_in_hand", SE3.identity(), np.diag(axes**2), "gripper", checks=checks
+        "eye_in_hand",
+        SE3.identity(),
+        np.diag(axes**2),
+        "gripper",
+        checks=checks_of(checks),
     )
 
 
@@ -152,4 +157,6 @@ def test_a_rotation_error_counts_at_the_target() -> None:
     # Two of three axes move the target: 2 m times 0.1 deg times sqrt(2 / 3).
     moved = 2000 * np.deg2rad(0.1) * np.sqrt(2 / 3)
     assert expected_error(far)[0] == pytest.approx(np.hypot(0.5, moved))
-    assert "2.00 m from the camera" in verdict(replace(far, checks={"target_m": 2.0}))
+    assert "2.00 m from the camera" in verdict(
+        replace(far, checks=checks_of({"target_m": 2.0}))
+    )

@@ -12,10 +12,11 @@ import pytest
 from evercal.calibration.audit import audit
 from evercal.calibration.calibration import Calibration, ErrorTerm, largest_term, rig_of
 from evercal.calibration.drift import check
-from evercal.calibration.from_images import Images, calibrate
-from evercal.calibration.from_images import _from_many_spots as from_many_spots
 from evercal.calibration.from_images import _lens_advice as lens_advice
-from evercal.calibration.from_images import _spots as spots_of
+from evercal.calibration.from_images import calibrate
+from evercal.calibration.from_map.spots import _spots as spots_of
+from evercal.calibration.from_map.spots import from_many_spots
+from evercal.calibration.image_source import Images
 from evercal.calibration.located import ImagePose, deviations, fuse, in_parent_frame
 from evercal.errors import InputError
 from evercal.geometry import SE3, UncertainPose, pose_distance
@@ -124,7 +125,7 @@ def test_terms_of_a_camera_on_the_gripper_contain_the_arm(
 @pytest.mark.parametrize(
     ("mount", "intrinsics", "advice"),
     [
-        ("eye_to_hand", "map", "give --camera with intrinsics from images of a board"),
+        ("eye_to_hand", "map", "give `camera` with intrinsics from images of a board"),
         ("eye_in_hand", "given", "; images from more spots determine it better."),
     ],
 )
@@ -170,7 +171,7 @@ def test_given_camera_is_used_and_saved(
     # `check` takes this camera, not the other one of the map.
     assert not check(adjusted, noisy(frame, 2, 1), calibration).moved
     assert calibration.source["intrinsics"] == "given"
-    assert "give --camera" not in calibration.verdict
+    assert "give `camera`" not in calibration.verdict
     lens = largest_term(calibration.error_terms)[0] == "lens"
     assert lens == ("The lens is the largest term" in calibration.verdict)
     assert lens  # where stated intrinsics are believed to 0.2 %
@@ -235,11 +236,11 @@ def test_eye_in_hand_needs_a_pose_for_every_image(
     localizer: Localizer, hall: Recording
 ) -> None:
     images = [("a", hall.test[0].read_image())]
-    with pytest.raises(InputError, match="--robot-poses"):
+    with pytest.raises(InputError, match="`robot_poses`"):
         calibrate(localizer, Images(images), "eye_in_hand")
     with pytest.raises(InputError, match="1 images and 2 robot poses"):
         calibrate(localizer, Images(images, base_from_gripper=SE3.identity((2,))))
-    with pytest.raises(InputError, match="state it with --mount"):
+    with pytest.raises(InputError, match="state it with `mount`"):
         calibrate(localizer, Images(images, base_from_gripper=SE3.identity((1,))))
 
 

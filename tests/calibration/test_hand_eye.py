@@ -10,15 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evercal.calibration.learned import calibration_at
+from evercal.calibration.from_map.hand_eye import verdict_of
+from evercal.calibration.learned import _of_version_0_1, calibration_at
 from evercal.calibration.verdict import TIERS, tier
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
-from evercal.learning.scene import LearnReport
+from evercal.learning.report import LearnReport
 from evercal.localization.localizer import Localizer
 from evercal.map import Map
 from evercal.mapping.scene_map import MapContents
-from evercal.mapping.store import MapStore
+from evercal.mapping.store import MapStore, stored_scenes
 from evercal.recordings import Recording, load_recording
 from evercal.recordings.frame import lacks_camera_poses
 from evercal.recordings.samples import FOLDER
@@ -90,7 +91,7 @@ def test_the_map_keeps_the_calibration(
     assert max(pose_distance(calibration.parent_from_child, estimate.pose)) < 1e-12
     np.testing.assert_array_equal(calibration.covariance, estimate.covariance)
     assert calibration.camera == cell.localizer.contents.scenes[0].adjusted_camera
-    assert calibration.created == report.hand_eye.created != ""
+    assert calibration.created == report.hand_eye.calibration.created != ""
     cell.rename("arm", "bench")
     assert (
         calibration_at(tmp_path / "cell").to_dict()
@@ -114,13 +115,22 @@ def test_the_map_keeps_the_calibration(
     )
     parts = [term.translation_mm for term in calibration.error_terms]
     assert np.linalg.norm(parts) == pytest.approx(calibration.sigma_mm)
-    doubtful = replace(
-        report.hand_eye, warnings=("the clocks differ",), advice="turn more"
-    )
-    verdict = doubtful.calibration(
-        cell.localizer.contents.scenes[0].camera, "arm", 60
-    ).verdict
-    assert verdict == "Do not rely on it: the clocks differ. Turn more."
+    sentences = verdict_of(calibration, ["the clocks differ"], "turn more")
+    assert sentences == "Do not rely on it: the clocks differ. Turn more."
+
+
+def test_a_report_written_before_version_0_2_gives_the_same_calibration(
+    learned: tuple[Path, LearnReport],
+) -> None:
+    folder, report = learned
+    _, camera, stored = stored_scenes(folder)[0]
+    del stored["calibration"]
+    expected = Map.open(folder).calibration()
+    again = _of_version_0_1(stored)
+    assert replace(again, camera=camera).to_dict() == expected.to_dict()
+    assert json.loads(json.dumps(report.to_dict())) == stored
+    read = LearnReport.from_stored(report.stored())
+    assert json.loads(json.dumps(read.to_dict())) == stored
 
 
 def test_a_map_without_gripper_poses_has_no_calibration(

@@ -4,9 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from evercal.calibration.from_map.hand_eye_start import HandEyeStart, ImagePair
-from evercal.calibration.hand_eye import largest_step
+from evercal.calibration.from_map.hand_eye_start import HandEyeStart
+from evercal.calibration.from_map.image_pairs import ImagePair
 from evercal.calibration.held_thing.moving_parts import moving_parts
+from evercal.calibration.held_thing.slip import largest_step
 from evercal.calibration.held_thing.windows import cropped, windows
 from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame

@@ -149,7 +149,7 @@ def test_from_photographs_to_a_calibration(run: Any, tmp_path: Path) -> None:
     assert np.linalg.norm(difference[3:]) < np.deg2rad(0.1)
     assert calibration.camera is not None
     assert calibration.camera.fx == pytest.approx(CAMERA.fx, rel=1e-3)
-    assert calibration.checks["corner_sigma_px"] < 0.1
+    assert calibration.checks.to_dict()["corner_sigma_px"] < 0.1
 
 
 def test_detect_reports_images_without_a_board(run: Any, tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from evercal.recordings.frame import Recording
 
 EmptyScenes = Callable[[str], LearnedScenes]
 MakeStore = Callable[[Path, Sequence[LearnedScenes]], NetworkStore]
-Stages = dict[str, LearnedScenes]
 Rooms = tuple[Recording, Recording, Recording]
 Tree = Callable[[Path], dict[str, str]]
 

@@ -20,11 +20,11 @@ from evercal.features.encoder import ENCODER_FILE, load_encoder
 from evercal.learning.many import learn_scenes
 from evercal.learning.task import LearnTask
 from evercal.map import Map
-from evercal.mapping.build import MapOptions
 from evercal.mapping.scene_map import MapContents
-from evercal.mapping.store import MapStore
 from evercal.recordings import Recording
 from evercal.recordings.images import StoredImage
+
+from .small_maps import QUICK, small_map
 
 
 class Deadly(StoredImage):
@@ -49,14 +49,6 @@ def deadly(recording: Recording, marks: Path, times: int) -> Recording:
     first = recording.train[0]
     image = Deadly(first.read_image(), marks, times)
     return replace(recording, train=(replace(first, image=image), *recording.train[1:]))
-
-
-QUICK = MapOptions(adjust=False)
-
-
-def small_map(root: Path, encoder: Path | None = None) -> Map:
-    """A new map that encodes images at 64 pixels, which is fast."""
-    return Map(MapStore.create(root, encoder, short_side=64))
 
 
 @pytest.fixture(scope="module")

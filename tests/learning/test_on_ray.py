@@ -19,15 +19,14 @@ from evercal.cli.learn import read_recording
 from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
 from evercal.learning.task import LearnTask
-from evercal.map import Map
-from evercal.mapping.build import MapOptions
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
 from evercal.recordings import Recording
 from evercal.recordings.addresses import RecordingAt
 from evercal.recordings.formats import generic
 
-QUICK = MapOptions(adjust=False)
+from .small_maps import QUICK, small_map
+
 pytestmark = [
     pytest.mark.slow(
         "src/evercal/learning", "src/evercal/recordings", "src/evercal/mapping"
@@ -47,11 +46,6 @@ def folders(
             small = replace(room, name=room.name + copy, train=room.train[:16], test=())
             generic.write(root / small.name, small)
     return sorted(root.iterdir())
-
-
-def small_map(root: Path) -> Map:
-    """A new map that encodes images at 64 pixels, which is fast."""
-    return Map(MapStore.create(root, short_side=64))
 
 
 def kill_workers(stop: threading.Event, killed: list[int]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evercal.calibration.calibration import read_transform
+from evercal.calibration.transform_file import read_transform
 from evercal.cli.align import read_rows
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings import (

@@ -13,6 +13,7 @@ from evercal.calibration.calibration import (
     ImageUse,
     JointOffset,
 )
+from evercal.calibration.checks import checks_of
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.reports.calibration_images import AnnotatedImages
@@ -127,7 +128,9 @@ def test_verdict_comes_first() -> None:
     ],
 )
 def test_verdict_has_its_colour(mm: float, level: str, headline: str) -> None:
-    reader, page = read(full(checks={"repeatability_mm": 2 * mm}, verdict=""))
+    reader, page = read(
+        full(checks=checks_of({"repeatability_mm": 2 * mm}), verdict="")
+    )
     assert f'<header class="{level}"' in page.html
     assert reader.text("h1").startswith(headline)
 
@@ -234,7 +237,7 @@ def test_all_strings_are_escaped() -> None:
         child_frame="c" + MARKUP,
         images=(ImageUse(MARKUP, False, MARKUP, 1.0, 1.0),),
         error_terms=(ErrorTerm(MARKUP, 1.0, 1.0),),
-        checks={MARKUP: MARKUP},
+        checks=checks_of({MARKUP: MARKUP}),
         verdict=MARKUP,
         source={MARKUP: MARKUP, "deep": {"a": [MARKUP]}},
         created=MARKUP,
@@ -349,7 +352,7 @@ def test_boards_show_what_each_image_contributes() -> None:
         "information_percent": {"shots/a.png": 30.0},
         "leave_one_out_mm": {"shots/a.png": 0.2},
     }
-    reader, _ = read(full(checks=checks))
+    reader, _ = read(full(checks=checks_of(checks)))
     assert reader.row("fx (px)") == ["fx (px)", "150.0000", "0.5000"]
     [row] = [row for row in reader.rows if row[1:2] == ["a.png"]]
     assert row[-2:] == ["30.0", "0.200"]
@@ -362,7 +365,7 @@ def test_joints_of_the_arm_are_listed_with_what_would_close_them() -> None:
         JointOffset("rail", -0.0031, 0.0004, is_angle=False),
     )
     checks = {"joints_move_mm": [4.5, 6.25]}
-    own = full(joints=joints, joint_covariance=np.eye(3), checks=checks)
+    own = full(joints=joints, joint_covariance=np.eye(3), checks=checks_of(checks))
     reader, page = read(own)
     assert [
         "pan (deg)",

@@ -31,33 +31,34 @@ def arm_change(
     """
     from scipy import stats
 
-    names = [
-        ", ".join(joint.name for joint in each.joints) for each in (reference, now)
-    ]
-    if names[0] != names[1]:
-        other = (
-            f"the reference is of joints [{names[0]}], the recording of [{names[1]}]"
-        )
+    before = ", ".join([joint.name for joint in reference.joints])
+    after = ", ".join([joint.name for joint in now.joints])
+    if before != after:
         raise InputError(
-            f"{other}: give a recording of the same arm, with its joint values"
+            f"the reference is of joints [{before}], the recording of [{after}]: give a recording"
+            " of the same arm, with its joint values"
         )
     joints = []
-    for a, b in zip(reference.joints, now.joints, strict=True):
-        sigma = float(np.hypot(a.sigma, b.sigma))
-        joints.append(
-            replace(b, offset=b.offset - a.offset, sigma=sigma, open=a.open or b.open)
-        )
-    both = [i for i, joint in enumerate(joints) if not joint.open]
-    if not both:
+    determined = []
+    for i, (old, new) in enumerate(zip(reference.joints, now.joints, strict=True)):
+        sigma = float(np.hypot(old.sigma, new.sigma))
+        offset = new.offset - old.offset
+        is_open = old.open or new.open
+        joints.append(replace(new, offset=offset, sigma=sigma, open=is_open))
+        if not is_open:
+            determined.append(i)
+    if not determined:
         raise InputError(
             "no joint's offset is determined in both recordings: turn all joints more"
         )
-    change, sigma = np.array([(joints[i].offset, joints[i].sigma) for i in both]).T
+    change = np.array([joints[i].offset for i in determined])
+    sigma = np.array([joints[i].sigma for i in determined])
     covariance = reference.joint_covariance + now.joint_covariance
-    weight = np.linalg.inv(covariance[np.ix_(both, both)])
+    weight = np.linalg.inv(covariance[np.ix_(determined, determined)])
     confidence = float(stats.chi2.cdf(change @ weight @ change, len(change)))
     # Offsets are correlated: the surprise that is gone if this joint alone has changed.
     explained = np.abs(weight @ change) / np.sqrt(np.diag(weight))
     far = (np.abs(change) > _SIGMAS * sigma) | (explained == explained.max())
     far &= (np.abs(change) > _LEAST) & (confidence >= CONFIDENCE)
-    return confidence, [joints[i].name for i in np.array(both)[far]], joints
+    changed = np.array(determined)[far]
+    return confidence, [joints[i].name for i in changed], joints

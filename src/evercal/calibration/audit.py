@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from evercal.calibration.calibration import read_transform
 from evercal.calibration.located import ImagePose, fuse, locate
+from evercal.calibration.transform_file import read_transform
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg
 from evercal.recordings.images import Picture, files_in
@@ -107,27 +107,28 @@ def _audited(
 
 
 def _shots(episode: Path, stated: SE3 | None, count: int) -> list[_Shot]:
-    pose_file = next(
-        (episode / name for name in POSE_FILES if (episode / name).is_file()), None
-    )
-    pose = stated if pose_file is None else read_transform(pose_file)
+    pose = stated
+    for name in POSE_FILES:
+        if (episode / name).is_file():
+            pose = read_transform(episode / name)
+            break
+    shots: list[_Shot] = []
     if recognised(episode) is not None:
         scene = load_recording(episode)
-        every = [
-            (frame.name, frame.image, frame.camera, frame.base_from_camera or pose)
-            for frame in (*scene.train, *scene.test)
-        ]
+        for frame in (*scene.train, *scene.test):
+            base_from_camera = frame.base_from_camera or pose
+            if base_from_camera is not None:
+                shot = (frame.name, frame.image, frame.camera, base_from_camera)
+                shots.append(shot)
     else:
         files = files_in(episode, glob="**/*")
         if files and pose is None:
             raise InputError(
                 f"{episode}: states no camera pose; put a {' or '.join(POSE_FILES)} there, or give"
-                " the pose of all episodes with --calibration"
+                " the pose of all episodes with `calibration`"
             )
-        every = [(file.name, file, None, pose) for file in files]
-    shots = [
-        (name, image, camera, at) for name, image, camera, at in every if at is not None
-    ]
+        if pose is not None:
+            shots = [(file.name, file, None, pose) for file in files]
     if not shots:
         raise InputError(f"{episode}: no images with a stated camera pose in it")
     chosen = np.unique(np.linspace(0, len(shots) - 1, count).round().astype(int))

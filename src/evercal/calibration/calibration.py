@@ -15,21 +15,21 @@ repeat other values for their readers.
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NamedTuple, Self, get_args
 
 import numpy as np
 
+from evercal.calibration.checks import Checks, checks_of
 from evercal.calibration.framed_pose import FramedPose
 from evercal.calibration.framed_pose import ImageUse as ImageUse
 from evercal.calibration.framed_pose import JointOffset as JointOffset
 from evercal.choices import ExportFormat
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation, pose_distance
-from evercal.robot.mount import MountName
+from evercal.notebook import html_table
+from evercal.robot.mount import MountName, mount_named
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
-from evercal.storage.text_files import read_text
 from evercal.typing import Array, PathLike
 
 FORMAT = "evercal-calibration"
@@ -70,8 +70,8 @@ class Calibration(FramedPose):
 
     error_terms: tuple[ErrorTerm, ...] = ()
     """Parts of the covariance by cause; from images, those of `CovarianceTerm` and the scatter."""
-    checks: Mapping[str, Any] = field(default_factory=dict)
-    """Results of the checks, JSON values: `held_out_mm`, `repeatability_mm`, ..."""
+    checks: Checks = field(default_factory=Checks)
+    """What it was compared with: `ImageChecks`, `PairChecks` or `LearnedChecks`, by its origin."""
     verdict: str = ""
     """Uses that it serves, one or two sentences."""
     source: Mapping[str, Any] = field(default_factory=dict)
@@ -80,6 +80,9 @@ class Calibration(FramedPose):
     """ISO 8601 time with zone."""
 
     def __post_init__(self) -> None:
+        mount_named(self.mount)
+        if isinstance(self.checks, Mapping):
+            object.__setattr__(self, "checks", checks_of(self.checks))
         covariance = np.array(self.covariance, dtype=np.float64)
         if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
             raise ValueError(
@@ -106,6 +109,25 @@ class Calibration(FramedPose):
             )
         object.__setattr__(self, "joint_covariance", of_joints.reshape(k, k))
 
+    def __repr__(self) -> str:
+        return f"Calibration({', '.join(self._in_words().values())})"
+
+    def _repr_html_(self) -> str:
+        words = self._in_words()
+        used = sum(image.used for image in self.images)
+        words["images"] = f"{used} of {len(self.images)} used"
+        words["verdict"] = self.verdict
+        return html_table("Calibration", words)
+
+    def _in_words(self) -> dict[str, str]:
+        x, y, z = 1000 * self.parent_from_child.translation_m
+        return {
+            "mount": self.mount,
+            "transform": f"{self.parent_frame}_from_{self.child_frame}",
+            "position": f"({x:.1f}, {y:.1f}, {z:.1f}) mm",
+            "standard deviation": f"{self.sigma_mm:.2f} mm, {self.sigma_deg:.3f} deg",
+        }
+
     @property
     def sigma_mm(self) -> float:
         """One standard deviation of the translation, root mean square of the axes."""
@@ -128,7 +150,7 @@ class Calibration(FramedPose):
             "camera": None if self.camera is None else self.camera.to_dict(),
             "images": [vars(image) for image in self.images],
             "error_terms": [vars(term) for term in self.error_terms],
-            "checks": dict(self.checks),
+            "checks": self.checks.to_dict(),
             "joints": [vars(joint) for joint in self.joints],
             "joint_covariance": self.joint_covariance.tolist(),
             "verdict": self.verdict,
@@ -169,7 +191,7 @@ class Calibration(FramedPose):
             camera=None if lens is None else Camera.from_dict(lens),
             images=tuple(ImageUse(**row) for row in data.get("images", [])),
             error_terms=tuple(ErrorTerm(**row) for row in data.get("error_terms", [])),
-            checks=data.get("checks", {}),
+            checks=checks_of(data.get("checks", {})),
             joints=tuple(JointOffset(**row) for row in data.get("joints", [])),
             joint_covariance=np.array(data.get("joint_covariance", []), np.float64),
             verdict=str(data.get("verdict", "")),
@@ -193,22 +215,6 @@ class Calibration(FramedPose):
 def read_calibration(path: PathLike) -> Calibration:
     """Read a calibration file."""
     return read_record(path, "calibration file", Calibration.from_dict)
-
-
-def read_transform(path: PathLike) -> SE3:
-    """Read a rigid transform from a calibration file or from a 4x4 matrix as text."""
-    text = read_text(Path(path), "file")
-    if text.lstrip().startswith("{"):
-        return read_calibration(path).parent_from_child
-    try:
-        numbers = [float(word) for word in text.replace(",", " ").split()]
-        if len(numbers) != 16:
-            raise ValueError(f"{len(numbers)} numbers, a 4x4 matrix has 16")
-        return SE3.from_matrix(np.reshape(numbers, (4, 4)))
-    except ValueError as error:
-        raise InputError(
-            f"{path}: {error}; give a 4x4 matrix as text, metres, or evercal's calibration JSON"
-        ) from None
 
 
 class RigPair(NamedTuple):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evercal.calibration.calibration import Calibration, ImageUse
-from evercal.calibration.held_thing.held_again import LEAST_IMAGES, held_again
+from evercal.calibration.held_thing.held_again import LEAST_GRIPS, held_again
 from evercal.calibration.located import (
     Fused,
     ImagePose,
@@ -35,14 +35,18 @@ if TYPE_CHECKING:
 
 CONFIDENCE = 0.99
 """Least confidence that a camera moved at all."""
-_LEAST_MM, _LEAST_DEG = 0.7, 0.04
-"""A shift counts as a move if it exceeds one of these."""
+_LEAST_MM = 0.7
+"""Smaller shifts, millimetres, are no move."""
+_LEAST_DEG = 0.04
+"""Smaller rotations, degrees, are no move."""
 _FLOOR = np.repeat([0.2e-3, np.deg2rad(0.008)], 3)
 """Standard deviation per axis from changes of light and objects, metres and radians."""
-_USUAL_SCATTER, _USUAL_WEIGHT = np.repeat([0.4e-3, np.deg2rad(0.01)], 3), 5.0
-"""Prior scatter of a single image per axis, metres and radians, and its weight in images."""
+_USUAL_SCATTER = np.repeat([0.4e-3, np.deg2rad(0.01)], 3)
+"""Prior scatter of a single image per axis, metres and radians."""
+_USUAL_WEIGHT = 5.0
+"""Weight of the prior scatter, in images."""
 _CAMERA_OR_GRIP = (
-    f"The camera, or the thing in the gripper: {LEAST_IMAGES} images that turn it about two axes"
+    f"The camera, or the thing in the gripper: {LEAST_GRIPS} images that turn it about two axes"
     " show which of them moved."
 )
 
@@ -79,24 +83,22 @@ def check(
     """Test whether a camera has moved since its calibration, see `Map.check`."""
     _require_fixed(reference)
     located = locate(localizer, images, camera or reference.camera, on_image)
-    if (
-        shows_held_thing(localizer, located, base_from_gripper)
-        and base_from_gripper is not None
-    ):
-        if (another := held_again(located, base_from_gripper)) is not None:
-            calibration = another.solution.calibration()
-            now = calibration.uncertain_pose
-            uses = calibration.images
-            covariance = now.covariance + reference.covariance
-            return shift_of(
-                reference, now.pose, covariance, CONFIDENCE, uses, another.sentence
-            )
-        # The lens errs now as it did then. The map does not: the thing is seen from another side.
-        located = in_parent_frame(of_cause(located, lens=False), base_from_gripper)
-        shift = shift_between(reference, fuse(located), located, localizer)
-        few = shift.moved and sum(item.is_located for item in located) < LEAST_IMAGES
-        return replace(shift, note=_CAMERA_OR_GRIP) if few else shift
-    return shift_between(reference, fuse(located), located, localizer)
+    if not shows_held_thing(localizer, located, base_from_gripper):
+        return shift_between(reference, fuse(located), located, localizer)
+    assert base_from_gripper is not None, "a held thing needs gripper poses"
+    grip = held_again(located, base_from_gripper)
+    if grip is not None:
+        calibration = grip.solution.calibration()
+        covariance = calibration.covariance + reference.covariance
+        pose = calibration.parent_from_child
+        shift = shift_of(reference, pose, covariance, images=calibration.images)
+        return replace(shift, note=grip.sentence)
+    # The lens errs now as it did then. The map does not: the thing is seen from another side.
+    located = in_parent_frame(of_cause(located, lens=False), base_from_gripper)
+    shift = shift_between(reference, fuse(located), located, localizer)
+    if shift.moved and sum(item.is_located for item in located) < LEAST_GRIPS:
+        return replace(shift, note=_CAMERA_OR_GRIP)
+    return shift
 
 
 def shift_between(
@@ -115,10 +117,8 @@ def shift_between(
     measured = [(fused.scatter, count)]
     if same:
         # One camera in one map: the scatter of its images is the same before and now.
-        before = int(reference.checks.get("images_used", 1))
-        measured.append(
-            (np.array(reference.checks.get("image_scatter", np.zeros((6, 6)))), before)
-        )
+        before = int(reference.checks.images_used or 1)
+        measured.append((_image_scatter(reference), before))
         scatter = _scatter(measured)
         covariance = scatter / count + scatter / before + floor
         if scene.parent_frame == "gripper":
@@ -129,9 +129,8 @@ def shift_between(
         used = [item.covariance for item in fused.select(located)]
         covariance = _scatter(measured) / count + floor
         covariance = covariance + reference.covariance + np.mean(used, axis=0)
-    return shift_of(
-        reference, fused.pose, covariance, confidence, fused.uses, same_map=same
-    )
+    shift = shift_of(reference, fused.pose, covariance, confidence, fused.uses)
+    return replace(shift, same_map=same)
 
 
 def _require_fixed(reference: Calibration) -> None:
@@ -148,8 +147,6 @@ def shift_of(
     covariance: Array,
     confidence: float = CONFIDENCE,
     images: tuple[ImageUse, ...] = (),
-    note: str = "",
-    same_map: bool = False,
 ) -> Shift:
     """The shift of a camera that is now at `pose`; covariance (6, 6) is of their difference."""
     from scipy import stats
@@ -167,10 +164,17 @@ def shift_of(
         confidence=probability,
         moved=probability >= confidence
         and (millimetres > _LEAST_MM or degrees > _LEAST_DEG),
-        same_map=same_map,
+        same_map=False,
         images=images,
-        note=note,
     )
+
+
+def _image_scatter(reference: Calibration) -> Array:
+    """(6, 6) scatter of the images of a calibration; zeros if it states none."""
+    scatter = reference.checks.image_scatter
+    if scatter is None:
+        return np.zeros((6, 6))
+    return np.array(scatter)
 
 
 def _scatter(measured: Sequence[tuple[Array, int]]) -> Array:

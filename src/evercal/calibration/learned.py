@@ -1,10 +1,19 @@
-"""The calibration of the camera on the gripper that a map keeps in the report of its scene."""
+"""The calibration that a map keeps of a scene that was learned from gripper poses."""
 
 import os
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from evercal.calibration.calibration import Calibration, read_calibration
+import numpy as np
+
+from evercal.calibration.calibration import Calibration, ErrorTerm, read_calibration
+from evercal.calibration.checks import checks_of
+from evercal.calibration.framed_pose import ImageUse, JointOffset
 from evercal.errors import InputError
+from evercal.geometry import SE3
+from evercal.robot.mount import mount_named
 from evercal.storage.stages import is_store
 from evercal.typing import PathLike
 
@@ -20,8 +29,7 @@ def calibration_at(path: PathLike) -> Calibration:
 
 
 def learned_calibration(root: Path, scene: str | None = None) -> Calibration:
-    """Return the `gripper_from_camera` of a scene, by default the only one with gripper poses."""
-    from evercal.calibration.hand_eye import HandEyeReport
+    """Return the calibration of a scene, by default the only one with gripper poses."""
     from evercal.mapping.store import stored_scenes
 
     stored = {name: (camera, report) for name, camera, report in stored_scenes(root)}
@@ -35,10 +43,51 @@ def learned_calibration(root: Path, scene: str | None = None) -> Calibration:
         )
     name = scene or next(iter(wrist), None)
     if name not in wrist:
+        place = root if name is None else f"{root}:{name}"
         raise InputError(
-            f"{root if name is None else f'{root}:{name}'}: was not learned from gripper poses, so"
-            " it has no gripper_from_camera; run 'evercal calibrate' and give its file"
+            f"{place}: was not learned from gripper poses, so it has no gripper_from_camera; run"
+            " 'evercal calibrate' and give its file"
         )
     camera, report = stored[name]
-    hand_eye = HandEyeReport.from_dict(report["hand_eye"])
-    return hand_eye.calibration(camera, name, int(report["train_frames"]))
+    if "calibration" in report:
+        calibration = Calibration.from_dict(report["calibration"])
+    else:
+        calibration = _of_version_0_1(report)
+    # The scene may have another name now.
+    source = {**calibration.source, "scene": name}
+    return replace(calibration, camera=camera, source=source)
+
+
+def _of_version_0_1(report: Mapping[str, Any]) -> Calibration:
+    """The calibration of a report that states its values, written before version 0.2."""
+    from evercal.calibration.from_map.hand_eye import verdict_of
+
+    values = report["hand_eye"]
+    mount = mount_named(values.get("mount", "eye_in_hand"))
+    checks = {}
+    if values.get("image_scatter"):
+        checks["images_used"] = values["images_located"]
+        checks["image_scatter"] = values["image_scatter"]
+    if values.get("joints_move_mm"):
+        checks["joints_move_mm"] = values["joints_move_mm"]
+    calibration = Calibration(
+        mount.name,
+        SE3(values["quaternion_wxyz"], values["translation_m"]),
+        np.array(values["covariance"]),
+        parent_frame=mount.parent,
+        images=tuple(ImageUse(**row) for row in values.get("images", ())),
+        error_terms=tuple(ErrorTerm(**row) for row in values.get("error_terms", ())),
+        joints=tuple(JointOffset(**row) for row in values.get("joints", ())),
+        joint_covariance=np.array(values.get("joint_covariance", ())),
+        checks=checks_of(checks),
+        source={
+            "command": "learn" if mount.moves else "eye-to-hand",
+            "scene": report.get("scene"),
+            "frames": int(report["train_frames"]),
+            "map": values.get("map", ""),
+        },
+        created=values.get("created", ""),
+    )
+    warnings = values.get("warnings", ())
+    sentences = verdict_of(calibration, warnings, values.get("advice", ""))
+    return replace(calibration, verdict=sentences)

@@ -27,8 +27,10 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 _OUTLIER_SIGMAS = 5.0
 """Robust standard deviations from the mean beyond which a pose is an outlier."""
-_LEAST_M, _LEAST_RAD = 0.002, np.deg2rad(0.15)
-"""Smaller distances are never outliers."""
+_LEAST_M = 0.002
+"""Smaller distances from the mean, metres, are never outliers."""
+_LEAST_RAD = np.deg2rad(0.15)
+"""Smaller angles to the mean, radians, are never outliers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,13 +106,13 @@ def of_cause(located: Sequence[ImagePose], lens: bool) -> list[ImagePose]:
     """
     changed = []
     for item in located:
-        terms = [
-            term.covariance
-            for term in item.estimate.terms
-            if (term.name == "lens") == lens
-        ]
-        whole = item.covariance * (not lens)
-        covariance = sum(terms, np.zeros((6, 6))) if item.estimate.terms else whole
+        terms = []
+        for term in item.estimate.terms:
+            if (term.name == "lens") == lens:
+                terms.append(term.covariance)
+        covariance = sum(terms, np.zeros((6, 6)))
+        if not item.estimate.terms and not lens:
+            covariance = item.covariance
         changed.append(replace(item, covariance=covariance))
     return changed
 
@@ -124,7 +126,7 @@ def shows_held_thing(
     if held and base_from_gripper is None:
         raise InputError(
             f"scene {name} is a thing in the gripper: give the gripper's pose at every image with"
-            " --robot-poses"
+            " `robot_poses`"
         )
     return held
 
@@ -188,16 +190,17 @@ def _far(off: Array) -> BoolArray:
     ).any(1)
 
 
-def length_mm_deg(off: Array) -> tuple[float, float]:
+def length_mm_deg(deviation: Array) -> tuple[float, float]:
     """Return the length of one deviation (6,) in millimetres and degrees."""
-    return 1000 * float(np.linalg.norm(off[:3])), float(
-        np.rad2deg(np.linalg.norm(off[3:]))
-    )
+    millimetres = 1000 * float(np.linalg.norm(deviation[:3]))
+    degrees = float(np.rad2deg(np.linalg.norm(deviation[3:])))
+    return millimetres, degrees
 
 
 def halves_apart(poses: SE3) -> tuple[float, float] | None:
     """Return millimetres and degrees between the means of even and odd poses, at least four."""
     if len(poses) < 4:
         return None
-    first, second = (average_poses(poses[start::2]) for start in (0, 1))
-    return pose_distance_mm_deg(first, second)
+    even = average_poses(poses[0::2])
+    odd = average_poses(poses[1::2])
+    return pose_distance_mm_deg(even, odd)

@@ -36,31 +36,31 @@ def expected_error(calibration: Calibration) -> tuple[float, float]:
     The position counts at the distance of the target along the optical axis (`target_m` of the
     checks), or at the camera if that is larger. Halves of the data differ by twice the error.
     """
-    target = float(calibration.checks.get("target_m") or 0.0)
+    checks = calibration.checks
+    target = float(checks.target_m or 0.0)
     rotation = calibration.parent_from_child.rotation_matrix()
     slope = np.concatenate([np.eye(3), -rotation @ cross_matrix([0.0, 0.0, target])], 1)
     at_target = float(np.sqrt(np.trace(slope @ calibration.covariance @ slope.T)))
-    halves = [
-        float(calibration.checks.get(f"repeatability_{u}") or 0.0) / 2
-        for u in ("mm", "deg")
-    ]
-    mm = max(3**0.5 * calibration.sigma_mm, 1000 * at_target, halves[0])
-    return mm, max(3**0.5 * calibration.sigma_deg, halves[1])
+    half_mm = float(checks.repeatability_mm or 0.0) / 2
+    half_deg = float(checks.repeatability_deg or 0.0) / 2
+    mm = max(3**0.5 * calibration.sigma_mm, 1000 * at_target, half_mm)
+    return mm, max(3**0.5 * calibration.sigma_deg, half_deg)
 
 
 def verdict(calibration: Calibration) -> str:
     """Return one to three sentences: possible uses, the reason, and advice."""
-    use, (mm, deg) = tier(calibration), expected_error(calibration)
+    use = tier(calibration)
+    mm, deg = expected_error(calibration)
     checks = calibration.checks
     first = f"Unusable: even tabletop tasks ask for {TIERS[-1].mm:g} mm and {TIERS[-1].deg:g} deg."
     if use is not None:
         first = f"Good for {use.name} (within {use.mm:g} mm and {use.deg:g} deg)."
     first = f"{first} Expected error {_length(mm)} and {deg:.2f} deg"
-    if checks.get("target_m"):
-        first += f", {checks['target_m']:.2f} m from the camera"
-    if "held_out_mm" not in checks or "held_out_deg" not in checks:
+    if checks.target_m:
+        first += f", {checks.target_m:.2f} m from the camera"
+    if checks.held_out_mm is None or checks.held_out_deg is None:
         return f"{first}."
-    held_out = f"{_length(checks['held_out_mm'])} and {checks['held_out_deg']:.2f} deg"
+    held_out = f"{_length(checks.held_out_mm)} and {checks.held_out_deg:.2f} deg"
     return (
         f"{first}; single held-out poses differ by {held_out} (median). {_advice(use)}"
     )

@@ -175,7 +175,7 @@ def transform_of(file: Path | None) -> "SE3 | None":
     """The transform in a file of --gripper-from-camera or --calibration."""
     if file is None:
         return None
-    from evercal.calibration.calibration import read_transform
+    from evercal.calibration.transform_file import read_transform
 
     return read_transform(file)
 

@@ -15,7 +15,7 @@ from evercal.progress import progress_bar
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration, JointOffset, Rig
-    from evercal.calibration.from_images import Images
+    from evercal.calibration.image_source import Images
     from evercal.localization.localizer import Localizer
 
 
@@ -86,7 +86,7 @@ class Calibrate(args.Verb):
         return folders
 
     def _taken(self, files: list[Path]) -> "Images":
-        from evercal.calibration.from_images import Images
+        from evercal.calibration.image_source import Images
 
         camera = args.camera_for(self.camera, files)
         images = Images.of(files, camera, self.robot_poses, self.convention)
@@ -150,9 +150,9 @@ def calibration_lines(
     if point is not None:
         yield f"  point        {point.text(calibration.uncertain_pose)}"
     checks = calibration.checks
-    if "repeatability_mm" in checks:
-        mm = checks["repeatability_mm"]
-        deg = checks["repeatability_deg"]
+    if checks.repeatability_mm is not None:
+        mm = checks.repeatability_mm
+        deg = checks.repeatability_deg
         yield f"  two halves   of the images differ by {mm:.2f} mm and {deg:.3f} deg"
     images = calibration.images
     rejected = [image for image in images if not image.used]

@@ -51,7 +51,7 @@ class Check(args.Verb):
     def run(self) -> int:
         from evercal.calibration.calibration import read_calibration
         from evercal.calibration.drift import check
-        from evercal.calibration.from_images import Images
+        from evercal.calibration.image_source import Images
         from evercal.recordings.image_files import image_files
 
         reference = read_calibration(self.reference)

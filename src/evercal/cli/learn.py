@@ -19,7 +19,7 @@ from evercal.errors import InputError
 from evercal.progress import Bars
 
 if TYPE_CHECKING:
-    from evercal.learning.scene import LearnReport
+    from evercal.learning.report import LearnReport
     from evercal.mapping.built_map import Adjusted
     from evercal.recordings import Recording
 
@@ -158,7 +158,7 @@ class Learn(args.Verb):
                 on_scene=show,
                 on_progress=bars.step,
             )
-        record = {"scenes": list(map(dataclasses.asdict, reports))}
+        record = {"scenes": [report.to_dict() for report in reports]}
         self.answer(record, then=("localize", self.store, "IMAGE"))
         return 0
 
@@ -180,7 +180,7 @@ class Learn(args.Verb):
         if self.calibration is not None:
             lines.append(f"wrote {self.calibration}")
         then = self._next(recording, report, path)
-        self.answer(dataclasses.asdict(report), *lines, then=then)
+        self.answer(report.to_dict(), *lines, then=then)
         return 0
 
     def _learned(self, recording: "Recording", strategy: str) -> "LearnReport":
@@ -282,10 +282,11 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
         f"{report.scene}: {report.train_frames} images, {report.frames_kept} keyframes"
     )
     memory = size(report.memory_bytes)
-    if report.iterations:
+    networks = report.to_dict()
+    if networks["iterations"]:
         yield (
-            f"learned {kept}, {report.iterations} steps, {report.seconds:.0f} s; {memory} of"
-            f" keyframes and {size(report.head_bytes)} of networks for all scenes"
+            f"learned {kept}, {networks['iterations']} steps, {report.seconds:.0f} s; {memory} of"
+            f" keyframes and {size(networks['head_bytes'])} of networks for all scenes"
         )
     else:
         yield (
@@ -299,7 +300,7 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
     if found is not None:
         pose = found.parent_from_camera
         position = ", ".join(map("{:.1f}".format, 1000 * pose.pose.translation_m))
-        quaternion = ", ".join(map("{:.5f}".format, found.quaternion_wxyz))
+        quaternion = ", ".join(map("{:.5f}".format, pose.pose.rotation_wxyz))
         yield (
             f"gripper_from_camera: ({position}) mm, quaternion wxyz ({quaternion});"
             f" standard deviation {pose.sigma_mm:.2f} mm and {pose.sigma_deg:.3f} deg per axis;"
@@ -311,7 +312,7 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
         if found.given_mm is not None:
             far = f"{found.given_mm:.1f} mm and {found.given_deg:.1f} deg"
             yield f"distance from the given one: {far}"
-        yield from joint_lines(found.joints, file)
+        yield from joint_lines(found.calibration.joints, file)
     if report.adjusted is not None:
         row = adjusted_row(report.scene, dataclasses.asdict(report.adjusted))
         yield "; ".join(map("{} {}".format, row, row.values()))
@@ -319,7 +320,7 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
 
 
 def _warnings(adjusted: "Adjusted") -> Iterator[str]:
-    from evercal.calibration.hand_eye import MOST_FOCAL_PERCENT
+    from evercal.calibration.from_map.hand_eye import MOST_FOCAL_PERCENT
 
     if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
         yield (

@@ -94,6 +94,8 @@ class Solve(args.Verb):
 
     def _with_image_paths(self, calibration: "Calibration") -> "Calibration":
         """Make image paths relative to the calibration, where `evercal report` looks them up."""
+        from evercal.calibration.checks import PairChecks
+
         folder = self.camera_poses.absolute().parent
         target = self.out.absolute().parent
 
@@ -106,40 +108,44 @@ class Solve(args.Verb):
         images = [
             replace(image, name=moved(image.name)) for image in calibration.images
         ]
-        checks = {**calibration.checks}
+        assert isinstance(calibration.checks, PairChecks), "made by solve"
+        by_image = {}
         for key in _BY_IMAGE:
-            if key in checks:
-                values = checks[key].items()
-                checks[key] = {moved(name): value for name, value in values}
+            values = getattr(calibration.checks, key) or {}
+            by_image[key] = {moved(name): value for name, value in values.items()}
+        checks = replace(calibration.checks, **by_image)
         board = moved(self.camera_poses.name)
         source = {**calibration.source, "camera_poses": board}
         return replace(calibration, images=tuple(images), checks=checks, source=source)
 
 
 def _check_lines(calibration: "Calibration") -> Iterator[str]:
+    from evercal.calibration.checks import PairChecks
+
     checks = calibration.checks
+    assert isinstance(checks, PairChecks), "made by solve"
     camera = calibration.camera
-    if "held_out_mm" in checks:
-        error = f"{checks['held_out_mm']:.2f} mm and {checks['held_out_deg']:.3f} deg"
+    if checks.held_out_mm is not None:
+        error = f"{checks.held_out_mm:.2f} mm and {checks.held_out_deg:.3f} deg"
         yield f"  left out     half of the poses are predicted within {error}"
-    residual = f"{checks['residual_mm']:.2f} mm, {checks['residual_deg']:.3f} deg"
+    residual = f"{checks.residual_mm:.2f} mm, {checks.residual_deg:.3f} deg"
     yield f"  residuals    {residual} (root mean square)"
-    if "corner_sigma_px" in checks:
-        yield f"  corners      {checks['corner_sigma_px']:.2f} px (standard deviation)"
-    if checks.get("corners_left_out"):
-        where = ", ".join(checks["corners_left_out"])
+    if checks.corner_sigma_px is not None:
+        yield f"  corners      {checks.corner_sigma_px:.2f} px (standard deviation)"
+    if checks.corners_left_out:
+        where = ", ".join(checks.corners_left_out)
         yield f"  left out     corners that leave their neighbours (image x y): {where}"
-    if "scale" in checks:
-        scale = f"{checks['scale']:.6g} +- {checks['scale_sigma']:.2g}"
+    if checks.scale is not None:
+        scale = f"{checks.scale:.6g} +- {checks.scale_sigma:.2g}"
         yield f"  scale        {scale} (size of the board, or metres per unit)"
-    if camera is not None and "camera_sigma" in checks:
-        sigma = checks["camera_sigma"]
+    if camera is not None and checks.camera_sigma is not None:
+        sigma = checks.camera_sigma
         focal = f"fx {camera.fx:.2f}, fy {camera.fy:.2f} +- {sigma['fx']:.2f} px"
         centre = f"cx {camera.cx:.2f}, cy {camera.cy:.2f} +- {sigma['cx']:.2f} px"
         yield f"  intrinsics   {focal}, {centre}"
-    if "time_offset_s" in checks:
-        offset = 1000 * checks["time_offset_s"]
-        spread = 1000 * checks["time_offset_sigma_s"]
+    if checks.time_offset_s is not None:
+        offset = 1000 * checks.time_offset_s
+        spread = 1000 * (checks.time_offset_sigma_s or 0.0)
         yield f"  clocks       robot time = camera time {offset:+.1f} +- {spread:.1f} ms"
-    yield from map("  left open    {}".format, checks.get("left_open", ()))
-    yield from map("warning: {}".format, checks.get("warnings", ()))
+    yield from map("  left open    {}".format, checks.left_open or ())
+    yield from map("warning: {}".format, checks.warnings or ())

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from evercal.geometry import SE3, pose_distance
-from evercal.localization.localizer import Localizer
+from evercal.learning.located import localizer_of, located_poses
 from evercal.mapping.built_map import BuiltMap
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.selection import spread_poses
@@ -18,11 +18,13 @@ MOST_SHARE = 0.3
 SHARES = (0.05, 0.07, 0.1, 0.14, 0.2, MOST_SHARE)
 """Shares of the frames that are tried, smallest first."""
 PROBE_FRAMES = 60
-"""Other frames that are located, spread over the recording."""
+"""Maximum number of other frames that are located, spread over the recording."""
 LEAST_LOCATED = 0.98
-"""Share of the probes located by all keyframes that a subset must locate as well."""
-MOST_M, MOST_DEG = 0.005, 0.5
-"""Largest distance from the pose by all keyframes."""
+"""Least share of the probes located by all keyframes that a subset locates as well."""
+MOST_M = 0.005
+"""Largest distance from the position by all keyframes, metres."""
+MOST_DEG = 0.5
+"""Largest angle to the rotation by all keyframes, degrees."""
 
 
 def fewest_keyframes(
@@ -36,40 +38,37 @@ def fewest_keyframes(
     `contents` holds the scenes learned before, and `frames` are the posed training frames in
     recorded order. Returns sorted indices; all keyframes if they locate no other frame.
     """
-    others = [frame for frame in frames if frame.name not in set(built.keyframe_names)]
-    poses = built.scene.keyframes.base_from_camera
-    everything = np.arange(len(poses))
-    spread = (
-        np.linspace(0, len(others) - 1, min(PROBE_FRAMES, len(others)))
-        .round()
-        .astype(int)
-    )
-    localizer = Localizer(contents.empty().with_scene(built.scene))
-    located = _located(localizer, [others[i] for i in spread])
-    probes = [
-        others[i] for i, pose in zip(spread, located, strict=True) if pose is not None
-    ]
-    reference = [pose for pose in located if pose is not None]
+    names = set(built.keyframe_names)
+    others = [frame for frame in frames if frame.name not in names]
+    keyframes = built.scene.keyframes.base_from_camera
+    count = min(PROBE_FRAMES, len(others))
+    spread = np.linspace(0, len(others) - 1, count).round().astype(int)
+    localizer = localizer_of(contents, built.scene)
+    probes = []
+    references = []
+    candidates = [others[i] for i in spread]
+    located = located_poses(localizer, candidates)
+    for frame, pose in zip(candidates, located, strict=True):
+        if pose is not None:
+            probes.append(frame)
+            references.append(pose)
     unit = built.scene.frame.scale
     sizes = sorted({max(1, int(share * built.scene.train_frames)) for share in SHARES})
-    for step, size in enumerate(size for size in sizes if size < len(poses)):
+    fewest = np.arange(len(keyframes))
+    for step, size in enumerate(sizes):
+        if size >= len(keyframes):
+            break
         on_progress("selecting keyframes", step + 1, len(sizes))
-        selected = spread_poses(poses, size)
-        poses_of_few = _located(localizer.only(0, selected), probes)
-        good = [
-            _close(*pair, unit) for pair in zip(poses_of_few, reference, strict=True)
-        ]
-        if good and sum(good) >= LEAST_LOCATED * len(probes):
-            everything = selected
+        selected = spread_poses(keyframes, size)
+        poses = located_poses(localizer.only(0, selected), probes)
+        close = 0
+        for pose, reference in zip(poses, references, strict=True):
+            close += _close(pose, reference, unit)
+        if probes and close >= LEAST_LOCATED * len(probes):
+            fewest = selected
             break
     on_progress("selecting keyframes", len(sizes), len(sizes))
-    return everything
-
-
-def _located(localizer: Localizer, frames: Sequence[Frame]) -> list[SE3 | None]:
-    return [
-        localizer.localize(f.read_image(), f.camera).base_from_camera for f in frames
-    ]
+    return fewest
 
 
 def _close(pose: SE3 | None, reference: SE3, unit: float) -> bool:

@@ -4,12 +4,19 @@ The processes are those of this machine, or workers of a Ray cluster (`learning.
 is killed, for example for its memory, costs its recording another try, alone.
 """
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+import os
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.learning.on_ray import learn_on_ray
 from evercal.learning.task import Item, Learned, LearnTask, Source
 from evercal.processes import Worker, cause_of, cores, first_answers
+from evercal.progress import OnProgress
+from evercal.recordings.addresses import RecordingAt, is_address
+from evercal.recordings.frame import Recording, checked_name
+from evercal.recordings.held_out import named_recording
+from evercal.typing import PathLike
 
 TRIES = 3
 """Attempts before a recording whose process is killed is given up."""
@@ -101,3 +108,68 @@ def _begin(state: _State) -> Callable[[Item], Learned]:
     task, threads = state
     cv2.setNumThreads(threads)
     return lambda item: task.learn(*item)
+
+
+def named_sources(
+    recordings: Iterable[PathLike | Recording],
+    read: Callable[[Path], Recording],
+    taken: Iterable[str],
+    absolute: bool,
+) -> tuple[list[Source], list[str]]:
+    """Recordings under the names of their scenes, and why the others cannot be used.
+
+    A name that is `taken`, or that two recordings have, is refused. Paths become `absolute` where
+    workers begin in another folder.
+    """
+    taken = {*taken}
+    sources: list[Source] = []
+    failed: list[str] = []
+    for item in recordings:
+        try:
+            if isinstance(item, Recording):
+                source = item
+            elif is_address(item):
+                source = RecordingAt.of(str(item))
+            elif absolute:
+                source = read(Path(os.path.abspath(item)))
+            else:
+                source = read(Path(item))
+            checked_name(source.name)
+        except InputError as error:
+            failed.append(str(error))
+            continue
+        sources.append(named_recording(source, None, taken))
+        taken.add(source.name)
+    return sources, failed
+
+
+def results_at(results: PathLike | None) -> str | None:
+    """Address of the folder of results; a path becomes absolute."""
+    if results is None:
+        return None
+    if is_address(results):
+        return os.fspath(results)
+    return os.path.abspath(results)
+
+
+def in_given_order(
+    outcomes: Iterable[Learned], total: int, on_progress: OnProgress
+) -> Iterator[Learned]:
+    """Outcomes in the order of their recordings, each as soon as those before it are known."""
+    on_progress("learning", 0, total)
+    ready: dict[int, Learned] = {}
+    following = 0
+    for done, outcome in enumerate(outcomes, 1):
+        on_progress("learning", done, total)
+        ready[outcome.number] = outcome
+        while following in ready:
+            yield ready.pop(following)
+            following += 1
+
+
+def refuse_failures(failed: Sequence[str], total: int) -> None:
+    """Refuse recordings that were not learned, after the others were."""
+    if failed:
+        raise InputError(
+            f"{len(failed)} of {total} recordings were not learned: {'; '.join(failed)}"
+        )

@@ -10,10 +10,14 @@ from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_map import LeftOut, MapContents, SceneMap
 from evercal.recordings.frame import Frame
 from evercal.recordings.images import as_rgb
+from evercal.typing import Array
 
-LEAST_ANSWERS, WRONG_PLACE_M = 8, 0.5
-"""Least number of answers that the scatter is fitted to. Answers farther than this from the stated
-pose are outliers and are ignored."""
+LEAST_ANSWERS = 8
+"""Least number of answers that the scatter is fitted to."""
+WRONG_PLACE_M = 0.5
+"""Answers farther than this from the stated position are outliers, metres."""
+LEAST_VARIANCE = 1e-18
+"""Least variance of an answer along any direction."""
 
 
 def with_scatter(
@@ -24,8 +28,8 @@ def with_scatter(
 ) -> SceneMap:
     """The newest scene of a map, with the scatter of its stated frame.
 
-    The scatter is as large as the errors of frames ask for that the map was not built from, aligned
-    from their stated poses.
+    Fitted to frames that were held out and aligned from their stated poses: the smallest scatter
+    that explains their errors.
 
     Args:
         contents: The map.
@@ -38,58 +42,59 @@ def with_scatter(
     # Scatter and its bounds are in the unit of the map.
     bare = replace(scene, frame=replace(scene.frame, frame_sigma=(0.0, 0.0)))
     localizer = Localizer(replace(contents, scenes=[*others, bare]))
-    answers = _located(localizer, held_out, scene)
+    answers = _aligned(localizer, held_out, scene)
     for part in left_out:
         few = localizer.only(len(others), part.keyframes)
-        answers += _located(few, part.frames, scene)
-    answers = [
-        answer for answer in answers if np.linalg.norm(answer.off[:3]) < WRONG_PLACE_M
-    ]
+        answers += _aligned(few, part.frames, scene)
     if len(answers) < LEAST_ANSWERS:
         return scene
-    off = np.array([answer.off for answer in answers])
-    spread = np.array([answer.covariance for answer in answers])
-    spread = spread + np.diag(np.repeat(np.square(noise), 3))
-    metres, radians = (
-        max(known, scatter(off[:, part], spread[:, part, part]))
-        for known, part in zip(
-            scene.frame.frame_sigma, (slice(0, 3), slice(3, 6)), strict=True
-        )
-    )
-    return replace(scene, frame=replace(scene.frame, frame_sigma=(metres, radians)))
+    errors = np.array([answer.error for answer in answers])
+    covariances = np.array([answer.covariance for answer in answers])
+    covariances = covariances + np.diag(np.repeat(np.square(noise), 3))
+    known_metres, known_radians = scene.frame.frame_sigma
+    metres = scatter(errors[:, :3], covariances[:, :3, :3])
+    radians = scatter(errors[:, 3:], covariances[:, 3:, 3:])
+    sigma = (max(known_metres, metres), max(known_radians, radians))
+    return replace(scene, frame=replace(scene.frame, frame_sigma=sigma))
 
 
 class _Answer(NamedTuple):
     """A located frame beside its stated pose."""
 
-    off: np.ndarray
+    error: Array
     """(6,) translation in the base frame, unit of the map, and rotation about camera axes,
     radians."""
-    covariance: np.ndarray
+    covariance: Array
     """(6, 6)."""
 
 
-def _located(
+def _aligned(
     localizer: Localizer, frames: Sequence[Frame], scene: SceneMap
 ) -> list[_Answer]:
+    """Answers of alignments that begin at the stated poses, without outliers."""
     answers = []
     size = np.repeat([scene.frame.scale, 1.0], 3)
     index = localizer.scenes.index(scene.name)
     for frame in frames:
-        if (stated := frame.base_from_camera) is None:
+        stated = frame.base_from_camera
+        if stated is None:
             continue
         start = scene.frame.from_base(stated)
         image = as_rgb(frame.read_image())
         estimate = localizer.from_pose(image, frame.camera, index, start)
-        pose = estimate and estimate.uncertain_pose
-        if pose is not None and np.isfinite(pose.covariance).all():
-            turn = (pose.pose.inverse() @ stated).log()[3:]
-            off = np.r_[stated.translation_m - pose.pose.translation_m, turn]
-            answers.append(_Answer(off / size, pose.covariance / np.outer(size, size)))
+        answer = estimate and estimate.uncertain_pose
+        if answer is None or not np.isfinite(answer.covariance).all():
+            continue
+        rotation = (answer.pose.inverse() @ stated).log()[3:]
+        shift = stated.translation_m - answer.pose.translation_m
+        error = np.r_[shift, rotation] / size
+        if np.linalg.norm(error[:3]) < WRONG_PLACE_M:
+            covariance = answer.covariance / np.outer(size, size)
+            answers.append(_Answer(error, covariance))
     return answers
 
 
-def scatter(errors: np.ndarray, covariances: np.ndarray) -> float:
+def scatter(errors: Array, covariances: Array) -> float:
     """Smallest standard deviation per axis that makes errors fit their covariances.
 
     Errors are (n, 3), covariances (n, 3, 3). With the variance added to every axis, 90 % of the
@@ -100,7 +105,7 @@ def scatter(errors: np.ndarray, covariances: np.ndarray) -> float:
     from scipy.special import chdtri
 
     values, axes = np.linalg.eigh(covariances)
-    values = np.maximum(values, 1e-18)
+    values = np.maximum(values, LEAST_VARIANCE)
     squares = np.einsum("nji,nj->ni", axes, errors) ** 2
     limit = float(chdtri(3, 0.1))
 

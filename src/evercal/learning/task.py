@@ -4,14 +4,15 @@ import hashlib
 import pickle
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
 from evercal.errors import InputError
-from evercal.learning.scene import LearnReport, learn_scene
+from evercal.learning.report import LearnReport
+from evercal.learning.scene import learn_scene
 from evercal.mapping.build import MapOptions
 from evercal.mapping.manage import pack_map, unpack_map
 from evercal.mapping.scene_map import MapContents, SceneMap
@@ -93,7 +94,7 @@ def _keep(
     with tempfile.TemporaryDirectory(prefix="evercal-") as folder:
         root = Path(folder, "map")
         packed = Path(folder, "map.zip")
-        MapStore(root, contents.empty()).commit(scene, asdict(report))
+        MapStore(root, contents.empty()).commit(scene, report.stored())
         pack_map(root, packed)
         addresses.put(packed, file)
 
@@ -103,6 +104,6 @@ def _kept(file: str) -> tuple[SceneMap, LearnReport]:
         unpack_map(packed, Path(folder, "map"))
         store = MapStore.open(Path(folder, "map"))
         scene = store.contents.scenes[0]
-        report = LearnReport.from_dict(store.reports()[0])
+        report = LearnReport.from_stored(store.reports()[0])
         every = np.arange(len(scene.keyframes))  # taken out of the file, which goes
         return replace(scene, keyframes=scene.keyframes.take(every)), report

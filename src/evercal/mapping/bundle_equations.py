@@ -11,17 +11,13 @@ from evercal.geometry import SE3, Camera, cross_matrix
 from evercal.typing import Array, BoolArray, IntArray
 
 COMMON = 6
-"""Shared parameters of the common transform."""
 SHIFT = 1
-"""Shared parameters of the time shift."""
 INTRINSICS = 5
-"""Intrinsics: logarithm of the focal length, principal point in pixels, k1, k2."""
 SHARED = COMMON + SHIFT + INTRINSICS
-"""Shared parameters in this order. Offsets of an arm's joints come before the intrinsics."""
+"""Shared parameters: common transform, time shift, and intrinsics (logarithm of the focal length,
+principal point in pixels, k1, k2). Offsets of an arm's joints come before the intrinsics."""
 MIN_DEPTH = 0.05
 """Nearer points are projected as if they were at this depth, in units of `depth_scale`."""
-MIN_DEPTH_SUM = 1e-6
-"""Added to the diagonal of the inverse depths, which are divided by it."""
 MIN_DISTORTION = 1e-4
 """Smaller changes of k1 and k2 are ignored."""
 
@@ -116,14 +112,16 @@ class StatedFrames:
         change = parameters.shared[-INTRINSICS:]
         if not (self.same_lens and np.any(change)):
             return self._cameras
-        distorts = np.abs(change[3:]).max() > MIN_DISTORTION
-        corrected = {}
-        for camera in set(self._cameras):
-            changed = camera.changed(change)
-            if not distorts:
-                changed = replace(changed, distortion=camera.distortion)
-            corrected[camera] = changed
+        corrected = {
+            camera: self._changed(camera, change) for camera in set(self._cameras)
+        }
         return [corrected[camera] for camera in self._cameras]
+
+    @staticmethod
+    def _changed(camera: Camera, change: Array) -> Camera:
+        changed = camera.changed(change)
+        distorts = np.abs(change[3:]).max() > MIN_DISTORTION
+        return changed if distorts else replace(changed, distortion=camera.distortion)
 
     def linearise(self, tracks: BundleTracks, parameters: Parameters) -> Linearised:
         """Residuals and derivatives at given parameters."""
@@ -179,20 +177,23 @@ class StatedFrames:
 
     def _corrected(self, parameters: Parameters) -> tuple[Array, Array]:
         """Rotations (n, 3, 3) and positions (n, 3) of the corrected poses."""
-        translation, turn = np.split(parameters.correction, 2, axis=1)
-        rotation = self._rotation @ Rotation.from_rotvec(turn).as_matrix()
-        shift = np.einsum("nij,nj->ni", self._rotation, translation)
-        return rotation, self._position + shift
+        own = parameters.correction
+        rotation = self._rotation @ Rotation.from_rotvec(own[:, 3:]).as_matrix()
+        return rotation, self._position + np.einsum(
+            "nij,nj->ni", self._rotation, own[:, :3]
+        )
 
     def _by_camera(
         self, parameters: Parameters, frames: IntArray
     ) -> list[tuple[Camera, IntArray]]:
-        cameras = self.cameras(parameters)
-        groups = []
-        for camera in dict.fromkeys(cameras):
-            numbers = [i for i, other in enumerate(cameras) if other == camera]
-            groups.append((camera, np.flatnonzero(np.isin(frames, numbers))))
-        return groups
+        groups: dict[Camera, list[int]] = {}
+        for i, camera in enumerate(self.cameras(parameters)):
+            groups.setdefault(camera, []).append(i)
+        if len(groups) == 1:
+            return [(camera, np.arange(len(frames))) for camera in groups]
+        return [
+            (c, np.flatnonzero(np.isin(frames, which))) for c, which in groups.items()
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,39 +248,38 @@ class NormalEquations:
     ) -> Self:
         """Sum the products of derivatives, weighted (m,), over the observations of each host."""
         root = np.sqrt(weight)[:, None]
-        derivatives = np.concatenate([lin.by_host, lin.by_frame, lin.by_intrinsics], 2)
-        rows = derivatives * root[..., None]
+        p = len(tracks.host)
+        six = np.arange(6)
+        rows = (
+            np.concatenate([lin.by_host, lin.by_frame, lin.by_intrinsics], 2)
+            * root[..., None]
+        )
         residual = lin.residual * root
         by_depth = lin.by_depth * root
-        count = len(tracks.host)
-        depth = (
-            np.bincount(tracks.landmark, (by_depth**2).sum(1), count) + MIN_DEPTH_SUM
-        )
-        depth_slope = (by_depth * residual).sum(1)
-        depth_slope = np.bincount(tracks.landmark, depth_slope, count)
+        depth = np.bincount(tracks.landmark, (by_depth**2).sum(1), p) + 1e-6
+        depth_slope = np.bincount(tracks.landmark, (by_depth * residual).sum(1), p)
         mixed = np.einsum("mr,mrc->mc", by_depth, rows)
         gram = np.zeros(prior.shape)
         slope = slope.copy()
-        six = np.arange(6)
-        last = np.arange(len(gram) - INTRINSICS, len(gram))
         blocks = []
         for host in np.unique(tracks.host_frame):
-            of_host = np.flatnonzero(tracks.host_frame == host)
-            landmarks, place = np.unique(tracks.landmark[of_host], return_inverse=True)
-            frames, frame = np.unique(tracks.frame[of_host], return_inverse=True)
-            by_frames = (6 * frames[:, None] + six).ravel()
-            columns = np.concatenate([6 * host + six, by_frames, last])
-            local = np.zeros((len(columns), len(columns)))
+            own = np.flatnonzero(tracks.host_frame == host)
+            landmarks, place = np.unique(tracks.landmark[own], return_inverse=True)
+            frames = np.unique(tracks.frame[own])
+            last = np.arange(len(gram) - INTRINSICS, len(gram))
+            seen = (6 * frames[:, None] + six).ravel()
+            columns = np.concatenate([6 * host + six, seen, last])
+            local = np.zeros((len(columns),) * 2)
             block = np.zeros((len(landmarks), len(columns)))
-            for number in range(len(frames)):
-                in_frame = frame == number
-                observed = of_host[in_frame]
-                where = np.r_[0:6, 6 + 6 * number + six, -INTRINSICS:0]
-                product = rows[observed].reshape(-1, len(where))
-                local[where[:, None], where] += product.T @ product
-                slope[columns[where]] += product.T @ residual[observed].ravel()
+            for number, frame in enumerate(frames):
+                which = tracks.frame[own] == frame
+                part = own[which]
+                at = np.r_[0:6, 6 + 6 * number + six, -INTRINSICS:0]
+                product = rows[part].reshape(-1, len(at))
+                local[at[:, None], at] += product.T @ product
+                slope[columns[at]] += product.T @ residual[part].ravel()
                 # A frame sees a landmark once.
-                block[place[in_frame][:, None], where] += mixed[observed]
+                block[place[which][:, None], at] += mixed[part]
             gram[columns[:, None], columns] += local
             blocks.append(HostBlock(landmarks, columns, block))
         return cls(gram, prior, blocks, depth, slope, depth_slope.astype(np.float64))

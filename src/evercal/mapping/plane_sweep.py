@@ -29,11 +29,7 @@ SEEN_BY = 4
 SMOOTHING = 0.7
 """Share of a cell's neighbours in its similarity."""
 MIN_PEAK_SIMILARITY = 0.4
-"""Peaks of less similarity have no weight in the refinement."""
-_MOST_ROWS = 30_000
-"""Rows that are sampled at once: cv2.remap takes images of up to 32,767 rows."""
-DEPTH_STEP = 1e-4
-"""Step of a numerical derivative by the inverse depth, per metre."""
+_MOST_ROWS = 30_000  # cv2.remap takes images of up to 32,767 rows
 OUTLIER_PX = 4.0
 """Residuals beyond this have little weight in the refinement."""
 
@@ -125,8 +121,7 @@ class _SourceView:
     """Similarity of the cells of a view to all cells of one other view."""
 
     def __init__(self, view: PosedCells, other: PosedCells):
-        self.other = other
-        self.rows, self.columns = other.grid
+        self.other, (self.rows, self.columns) = other, other.grid
         other_from_view = other.base_from_camera.inverse() @ view.base_from_camera
         self.ray = view.rays() @ other_from_view.rotation_matrix().T
         self.translation = other_from_view.translation_m
@@ -134,12 +129,12 @@ class _SourceView:
 
     def pixels(self, inverse: Array) -> tuple[Array, Array, BoolArray]:
         """Columns and rows (cells, ...) at inverse depths (cells, ...), and whether visible."""
-        ray = self.ray.astype(inverse.dtype).T
-        ray = ray.reshape(3, -1, *[1] * (inverse.ndim - 1))
-        translation = self.translation.astype(inverse.dtype)
-        x = ray[0] + inverse * translation[0]
-        y = ray[1] + inverse * translation[1]
-        z = ray[2] + inverse * translation[2]
+        shape = (-1, *[1] * (inverse.ndim - 1))
+        x, y, z = (
+            self.ray[:, i].reshape(shape).astype(inverse.dtype)
+            + inverse * inverse.dtype.type(self.translation[i])
+            for i in range(3)
+        )
         front = z > 0.05
         z = np.where(front, z, 1)
         camera = self.other.camera
@@ -147,10 +142,8 @@ class _SourceView:
             pixels = camera.project(np.stack([x, y, z], -1))
             front &= np.isfinite(pixels).all(-1)
             u, v = np.moveaxis(np.nan_to_num(pixels).astype(inverse.dtype), -1, 0)
-        else:
-            u = camera.fx * x / z + camera.cx
-            v = camera.fy * y / z + camera.cy
-        return u, v, front
+            return u, v, front
+        return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, front
 
     def along(self, planes: Array) -> Array:
         """(cells, planes) similarity at inverse depths, 0 outside this view."""
@@ -164,36 +157,36 @@ class _SourceView:
             np.clip(at, 0, last, out=at)
         sampled = np.empty((cells, len(planes)), np.float32)
         # The grids of many cells one below the other are one image.
-        most = _MOST_ROWS // self.rows
-        tops = self.rows * np.arange(most, dtype=np.float32)[:, None]
-        for start in range(0, cells, most):
-            block = slice(start, start + most)
-            image = self.similarity[block].reshape(-1, self.columns)
-            below = down[block]
-            below = below + tops[: len(below)]
-            sampled[block] = cv2.remap(image, right[block], below, cv2.INTER_LINEAR)
+        block = _MOST_ROWS // self.rows
+        for start in range(0, cells, block):
+            part = slice(start, start + block)
+            image = self.similarity[part].reshape(-1, self.columns)
+            top = (
+                np.arange(len(image) // self.rows, dtype=np.float32)[:, None]
+                * self.rows
+            )
+            sampled[part] = cv2.remap(
+                image, right[part], down[part] + top, cv2.INTER_LINEAR
+            )
         return np.maximum(sampled, 0) * inside
 
     def normal_equation(self, inverse: Array) -> tuple[Array, Array]:
         """Gradient and Hessian (cells,) of least squares in the inverse depth of each cell."""
         rho = inverse.astype(np.float64)
-        u, v, front = self.pixels(rho)
-        here = np.stack([u, v], 1)
-        u, v, _ = self.pixels(rho + DEPTH_STEP)
-        slope = (np.stack([u, v], 1) - here) / DEPTH_STEP
+        *here, front = self.pixels(rho)
+        here = np.stack(here, 1)
+        delta = 1e-4
         stride = self.other.stride
-        centre = (stride - 1) / 2
-        cell = np.rint((here - centre) / stride).astype(int)
+        slope = (np.stack(self.pixels(rho + delta)[:2], 1) - here) / delta
+        cell = np.rint((here - (stride - 1) / 2) / stride).astype(int)
         last = np.array([self.columns - 2, self.rows - 2])
-        inner = cell.clip(1, last)
-        inside = front & (cell == inner).all(1)
-        position, similarity = peak(self.similarity, inner[:, 1], inner[:, 0])
-        residual = stride * position + centre - here
+        inside = front & (cell >= 1).all(1) & (cell <= last).all(1)
+        column, row = cell.clip(1, last).T
+        position, similarity = peak(self.similarity, row, column)
+        residual = stride * position + (stride - 1) / 2 - here
         weight = inside * np.maximum(similarity - MIN_PEAK_SIMILARITY, 0) ** 2
         weight = weight / (1 + (residual**2).sum(1) / OUTLIER_PX**2)
-        gradient = weight * (slope * residual).sum(1)
-        hessian = weight * (slope * slope).sum(1)
-        return gradient, hessian
+        return weight * (slope * residual).sum(1), weight * (slope * slope).sum(1)
 
 
 def peak(
@@ -207,19 +200,21 @@ def peak(
     """
     _, height, width = similarity.shape
     n = np.arange(len(similarity))
-    down, right = np.indices((3, 3)).reshape(2, 9) - 1
-    patch = similarity[n[:, None], row[:, None] + down, column[:, None] + right]
-    best = patch.argmax(1)
-    row = (row + down[best]).clip(1, height - 2)
-    column = (column + right[best]).clip(1, width - 2)
+    steps = np.array([(v, u) for v in (-1, 0, 1) for u in (-1, 0, 1)])
+    patch = similarity[
+        n[:, None], row[:, None] + steps[:, 0], column[:, None] + steps[:, 1]
+    ]
+    best = steps[patch.argmax(1)]
+    row = (row + best[:, 0]).clip(1, height - 2)
+    column = (column + best[:, 1]).clip(1, width - 2)
     middle = similarity[n, row, column]
-    left = similarity[n, row, column - 1]
-    right = similarity[n, row, column + 1]
-    above = similarity[n, row - 1, column]
-    below = similarity[n, row + 1, column]
-    u = column + parabola(left, middle, right)
-    v = row + parabola(above, middle, below)
-    return np.stack([u, v], 1), middle
+    du = parabola(
+        similarity[n, row, column - 1], middle, similarity[n, row, column + 1]
+    )
+    dv = parabola(
+        similarity[n, row - 1, column], middle, similarity[n, row + 1, column]
+    )
+    return np.stack([column + du, row + dv], 1), middle
 
 
 def parabola(before: Array, middle: Array, after: Array) -> Array:

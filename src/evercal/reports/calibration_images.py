@@ -224,7 +224,7 @@ def _scene_of(
 
 def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:
     """The board in each image of a calibration by `evercal solve`, whose file lies in `folder`."""
-    poses = calibration.checks.get("camera_from_board")
+    poses = calibration.checks.camera_from_board
     given = Path(str(calibration.source.get("camera_poses", "")))
     file = next(
         (f for f in (folder / given, given, folder / given.name) if f.is_file()), None
@@ -236,7 +236,7 @@ def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:
     except InputError:  # poses by other programs have no corners
         return {}
     views = {(file.parent / image.name).resolve(): image.view for image in board.images}
-    scale = float(calibration.checks.get("scale", 1.0))
+    scale = float(calibration.checks.scale or 1.0)
     seen = {}
     for name, pose in poses.items():
         view = views.get((folder / name).resolve()) or views.get(

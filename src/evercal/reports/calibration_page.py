@@ -133,7 +133,7 @@ def calibration_page(
 
 
 def _level(calibration: Calibration) -> Literal["good", "fair", "bad", ""]:
-    if not _has_uncertainty(calibration) and not calibration.checks:
+    if not _has_uncertainty(calibration) and not calibration.checks.to_dict():
         return ""
     best = tier(calibration)
     return "bad" if best is None else "fair" if best is TIERS[-1] else "good"
@@ -153,7 +153,7 @@ def _tiles(calibration: Calibration) -> list[Tile]:
         rejected = sum(not image.used for image in images)
         words = f"images used; {rejected} rejected" if rejected else "images used"
         tiles.append(Tile(f"{len(images) - rejected} of {len(images)}", words))
-    halves = calibration.checks.get("repeatability_mm")
+    halves = calibration.checks.repeatability_mm
     if halves is not None:
         words = "repeatability: difference between the positions from two halves of the data"
         tiles.append(Tile(f"{halves:.2f} mm", words))
@@ -198,9 +198,9 @@ def _missing(calibration: Calibration) -> list[str]:
         "No uncertainty: the calibration states none.": _has_uncertainty(calibration),
         "No list of images: the calibration holds none.": calibration.images,
         "No error budget: the calibration holds none.": calibration.error_terms,
-        "No repeatability: two halves of the data were not compared.": "repeatability_mm"
-        in checks,
-        "No held-out error: no data were held out.": "held_out_mm" in checks,
+        "No repeatability: two halves of the data were not compared.": checks.repeatability_mm
+        is not None,
+        "No held-out error: no data were held out.": checks.held_out_mm is not None,
         "No intrinsics: the calibration holds none.": calibration.camera,
     }
     return [sentence for sentence, present in gaps.items() if not present]
@@ -264,9 +264,8 @@ def use_table(calibration: Calibration) -> Table:
     checks = calibration.checks
     folders = {image.name[: image.name.rfind("/") + 1] for image in images}
     folder = folders.pop() if len(folders) == 1 else ""
-    share, moved = (
-        checks.get(key, {}) for key in ("information_percent", "leave_one_out_mm")
-    )
+    share = checks.information_percent or {}
+    moved = checks.leave_one_out_mm or {}
     rows = [
         (
             image.name.removeprefix(folder),
@@ -297,7 +296,7 @@ def camera_table(calibration: Calibration) -> Table:
     camera = calibration.camera
     rows = []
     if camera is not None:
-        sigma = calibration.checks.get("camera_sigma", {})
+        sigma = calibration.checks.camera_sigma or {}
         values = {
             f"{name} (px)": getattr(camera, name) for name in ("fx", "fy", "cx", "cy")
         }
@@ -314,7 +313,7 @@ def check_table(calibration: Calibration) -> Table:
     """The checks that were made and other values estimated with the transform."""
     rows = [
         (key.replace("_", " "), _cell(value))
-        for key, value in calibration.checks.items()
+        for key, value in calibration.checks.to_dict().items()
         if key not in _SHOWN_ELSEWHERE and len(_cell(value)) <= _LONGEST_CELL
     ]
     return Table(("check", "value"), rows)

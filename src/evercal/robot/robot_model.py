@@ -114,8 +114,7 @@ class RobotModel:
                 f"{source}: no values for joint {', '.join(missing)}, which {gripper} depends on;"
                 f" given are {', '.join(names) or 'none'}"
             )
-        columns = [list(names).index(name) for name in arm.joints]
-        values = values[:, columns]
+        values = values[:, [list(names).index(name) for name in arm.joints]]
         notes = [
             f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
         ]
@@ -133,13 +132,8 @@ class RobotModel:
             raise InputError(
                 f"{self.path}: no joints connect {base} and {gripper}; name others"
             )
-        steps = []
-        for joint in up:
-            if joint not in down:
-                steps.append((joint, True))
-        for joint in reversed(down):
-            if joint not in up:
-                steps.append((joint, False))
+        steps = [(joint, True) for joint in up if joint not in down]
+        steps += [(joint, False) for joint in reversed(down) if joint not in up]
         names: list[str] = []
         chain: list[MovingJoint] = []
         before = np.eye(4)
@@ -180,10 +174,9 @@ class RobotModel:
             step = factor * offsets[name]
             rotates = joint.type != "prismatic"
             weights = (0, step) if rotates else (step, 0)
-            motion = np.kron(weights, self._axis(joint))
+            motion = SE3.exp(np.kron(weights, self._axis(joint)))
             origin = SE3.from_matrix(self._origin(joint))
-            moved = origin @ SE3.exp(motion)
-            origins[joint.name] = (moved, rotates)
+            origins[joint.name] = (origin @ motion, rotates)
         return origins
 
     def _origin(self, joint: Any) -> Array:
@@ -238,9 +231,7 @@ class RobotModel:
     def _beyond_limits(self, name: str, column: Array) -> list[str]:
         """A sentence if values of a joint exceed its limits by 0.1, or two rotations."""
         joint = self._joint_named[name]
-        least = column.min()
-        most = column.max()
-        covered = f"joint {name} goes from {least:.2f} to {most:.2f}"
+        covered = f"joint {name} goes from {column.min():.2f} to {column.max():.2f}"
         if joint.type == "continuous":
             if np.ptp(column) > _LARGEST_RAD:
                 return [f"{covered}, more than two rotations; are these degrees?"]
@@ -249,7 +240,7 @@ class RobotModel:
         upper = getattr(joint.limit, "upper", None)
         if lower is None or upper is None:
             return []
-        if least >= lower - 0.1 and most <= upper + 0.1:
+        if column.min() >= lower - 0.1 and column.max() <= upper + 0.1:
             return []
         return [
             f"{covered}, the URDF allows {lower:.2f} to {upper:.2f}; are the joints in the"
@@ -279,6 +270,6 @@ class RobotModel:
 def _check_origins(tree: Any) -> None:
     """Refuse positions and angles in the XML of a URDF that are not three finite numbers."""
     for text in tree.xpath("/robot/joint/*/@xyz | /robot/joint/*/@rpy"):
-        numbers = [*map(float, text.split())]
+        numbers = [float(word) for word in text.split()]
         if np.isfinite(numbers).sum() != 3:
             raise ValueError(f"'{text}' are not three finite numbers")

@@ -19,7 +19,7 @@ from evercal.typing import PathLike
 
 if TYPE_CHECKING:
     from evercal.calibration.drift import Shift
-    from evercal.calibration.from_images import ImageSource
+    from evercal.calibration.image_source import ImageSource
 
 Part = tuple[str, bytes]
 """File name and content."""
@@ -146,7 +146,7 @@ def _image_parts(
     source: "ImageSource", robot_poses: PathLike | SE3 | None, camera: Camera | None
 ) -> Parts:
     """Images of one camera, with intrinsics and gripper poses if they are given."""
-    from evercal.calibration.from_images import Images
+    from evercal.calibration.image_source import Images
 
     parts: Parts = []
     pictures: Sequence[tuple[str, Any]] = Images.of(source).images

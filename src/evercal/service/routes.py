@@ -25,7 +25,8 @@ from starlette.websockets import WebSocketDisconnect
 
 from evercal.bounds import RequestBounds
 from evercal.calibration import drift
-from evercal.calibration.from_images import Images, calibrate
+from evercal.calibration.from_images import calibrate
+from evercal.calibration.image_source import Images
 from evercal.errors import InputError
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker

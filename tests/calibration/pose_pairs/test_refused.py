@@ -76,7 +76,8 @@ def test_degenerate_motions_are_refused(
         calibration = solve(pairs, mount)
         assert calibration.uncertain_pose.squared_mahalanobis(truth) < 16.8
         assert (
-            not noise or "turned about one point" in calibration.checks["warnings"][0]
+            not noise
+            or "turned about one point" in calibration.checks.to_dict()["warnings"][0]
         )
         return
     with pytest.raises(InputError, match=message):
@@ -223,7 +224,7 @@ def test_a_wrong_size_of_the_squares_is_named_and_estimated(mount: MountName) ->
     truth = recording(Setting(mount, path="table"), 7)
     pairs = camera_by(scaled(1.05))(truth.pairs)
     calibration = solve(pairs, mount)
-    [warning] = calibration.checks["warnings"]
+    [warning] = calibration.checks.to_dict()["warnings"]
     assert re.search(
         r"4\.\d+ \+- .* smaller .* 22\.\d\d mm|5\.\d+ \+- .* 22\.\d\d mm", warning
     )

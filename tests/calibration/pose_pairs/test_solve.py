@@ -58,7 +58,7 @@ def test_exact_poses_give_the_exact_calibration(
     assert calibration.parent_frame == ("gripper" if mount == "eye_in_hand" else "base")
     assert all(image.used for image in calibration.images)
     if scale is not None:
-        assert calibration.checks["scale"] == pytest.approx(scale, rel=1e-6)
+        assert calibration.checks.to_dict()["scale"] == pytest.approx(scale, rel=1e-6)
 
 
 @pytest.mark.parametrize("setting", [Setting(), Setting("eye_to_hand", outliers=3)])
@@ -121,7 +121,7 @@ def test_repeated_pairs_do_not_change_the_covariance() -> None:
 def test_checks_and_error_terms_match_the_noise() -> None:
     truth = recording(Setting(noise_mm=1.0, noise_deg=0.05, path="table"), 5)
     calibration = solve(truth.pairs, "eye_in_hand")
-    checks = calibration.checks
+    checks = calibration.checks.to_dict()
     # A held-out pose differs by its own noise along three axes, and a little more.
     assert 1.2 < checks["held_out_mm"] < 3.0
     assert 1.4 < checks["residual_mm"] < 2.4
@@ -148,7 +148,7 @@ def test_a_slip_is_named_and_widens_the_covariance(what: str, row: int) -> None:
     moved = [step.inverse() @ p if what == "camera" else p @ step for p in camera[row:]]
     slipped = replace(pairs, camera_from_board=SE3.stack([*camera[:row], *moved]))
     calibration = solve(slipped, mount)
-    [warning] = calibration.checks["warnings"]
+    [warning] = calibration.checks.to_dict()["warnings"]
     assert re.search(
         rf"the {what} looks moved by \d\.\d mm .* before row {row + 1},", warning
     )
@@ -159,7 +159,7 @@ def test_a_slip_is_named_and_widens_the_covariance(what: str, row: int) -> None:
     )
     for pose in (truth.parent_from_camera, after):
         assert calibration.uncertain_pose.squared_mahalanobis(pose) < 16.8
-    assert solve(pairs, mount).checks["warnings"] == []
+    assert solve(pairs, mount).checks.to_dict()["warnings"] == []
 
 
 class Photographed(NamedTuple):
@@ -225,7 +225,9 @@ def test_corners_improve_the_calibration(
             difference @ np.linalg.solve(calibration.covariance, difference)
         )
         with_corners.append(np.linalg.norm(difference[:3]))
-        assert calibration.checks["corner_sigma_px"] == pytest.approx(noise_px, rel=0.1)
+        assert calibration.checks.to_dict()["corner_sigma_px"] == pytest.approx(
+            noise_px, rel=0.1
+        )
         assert calibration.camera is not None
         assert calibration.camera.fx == pytest.approx(truth.camera.fx, rel=2e-3)
         plain = solve(pairs, mount).parent_from_child
@@ -288,7 +290,7 @@ def test_a_bent_board_is_no_worse_than_a_flat_one(bend_m: float) -> None:
             found.uncertain_pose.squared_mahalanobis(drawn.parent_from_camera)
         )
         assert found.camera is not None
-        sigma = found.checks["camera_sigma"]["fx"]
+        sigma = found.checks.to_dict()["camera_sigma"]["fx"]
         assert abs(found.camera.fx - drawn.camera.fx) < 4 * sigma
     assert np.mean(distances) < 10
 
@@ -385,7 +387,9 @@ def test_real_recordings(
     corners = BoardCorners(camera, views, stated=stated)
     solved = solve(PosePairs(tuple(images), robot, boards), mount, corners=corners)
     fixed_from_parent = robot if mount == "eye_in_hand" else robot.inverse()
-    sized = SE3(boards.rotation_wxyz, solved.checks["scale"] * boards.translation_m)
+    sized = SE3(
+        boards.rotation_wxyz, solved.checks.to_dict()["scale"] * boards.translation_m
+    )
     fixed = fixed_from_parent @ solved.parent_from_child @ sized
     assert np.median(pose_distance(average_poses(fixed), fixed)[0]) < apart_mm / 1000
     if published_m is not None:
@@ -404,5 +408,5 @@ def test_a_stated_focal_length_is_compared_with_the_corners(
     solved = solve(
         pairs, "eye_in_hand", corners=replace(corners, camera=stated, stated=True)
     )
-    warnings = solved.checks.get("warnings", ())
+    warnings = solved.checks.to_dict().get("warnings", ())
     assert any("stated focal length" in words for words in warnings) == warned

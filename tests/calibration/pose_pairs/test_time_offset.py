@@ -55,14 +55,16 @@ def streams(
 )
 def test_offset_and_transform_are_estimated(mount: MountName, offset: float) -> None:
     calibration = solve_with_offset(*streams(mount, offset, 1.0), mount)
-    sigma = calibration.checks["time_offset_sigma_s"]
+    sigma = calibration.checks.to_dict()["time_offset_sigma_s"]
     assert sigma < 0.002
-    assert calibration.checks["time_offset_s"] == pytest.approx(offset, abs=4 * sigma)
+    assert calibration.checks.to_dict()["time_offset_s"] == pytest.approx(
+        offset, abs=4 * sigma
+    )
     difference = error(calibration.parent_from_child, X)
     assert np.linalg.norm(difference[:3]) < 0.002
     assert difference @ np.linalg.solve(calibration.covariance, difference) < 25
     exact = solve_with_offset(*streams(mount, offset, 0.0), mount)
-    assert exact.checks["time_offset_s"] == pytest.approx(offset, abs=1e-4)
+    assert exact.checks.to_dict()["time_offset_s"] == pytest.approx(offset, abs=1e-4)
     assert np.linalg.norm(error(exact.parent_from_child, X)[:3]) < 1e-4
 
 

@@ -19,7 +19,7 @@ from evercal.continual.learning.stage import Encoding, StageOptions
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.store import NetworkStore, head_bytes
 from evercal.errors import InputError
-from evercal.learning.scene import LearnReport
+from evercal.learning.report import LearnReport
 
 from ..stages import Rooms, Tree
 

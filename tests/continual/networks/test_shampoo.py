@@ -12,16 +12,14 @@ from evercal.continual.networks.shampoo import (
     inverse_root,
 )
 
-from ..draws import seeded
-
 
 def _gradients(steps: int, width: int = 24) -> list[torch.Tensor]:
-    generator = seeded(0)
+    generator = torch.Generator().manual_seed(0)
     return [torch.randn(width, width, generator=generator) for _ in range(steps)]
 
 
 def test_inverse_root_inverts_the_square() -> None:
-    a = torch.randn(2, 60, 16, generator=seeded(1))
+    a = torch.randn(2, 60, 16, generator=torch.Generator().manual_seed(1))
     moment = a.mT @ a
     root = inverse_root(moment)
     mean = moment.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
@@ -35,7 +33,7 @@ def test_inverse_root_inverts_the_square() -> None:
 def test_double_precision_is_tried_if_single_fails(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    a = torch.randn(2, 60, 16, generator=seeded(1))
+    a = torch.randn(2, 60, 16, generator=torch.Generator().manual_seed(1))
     expected = inverse_root(a.mT @ a)
     eigh = torch.linalg.eigh
 

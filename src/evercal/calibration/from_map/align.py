@@ -6,6 +6,7 @@ X = gripper_from_camera, A X = Z B holds for Z = base_from_map, and both are est
 Alternatively, points that the tool has touched are picked in images.
 """
 
+import itertools
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,12 +26,14 @@ from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.mapping.map_frame import MapFrame, Similarity
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import Picture
+from evercal.storage.text_files import few
 from evercal.typing import Array, Image
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
 
-LEAST_IMAGES = 5
+LEAST_LOCATED = 5
+"""Least number of located images that align a map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +70,9 @@ def _in_own_frame(localizer: "Localizer", name: str) -> "Localizer":
 
     contents = localizer.contents
     scene = localizer.contents.scene(name)
-    own = replace(scene, frame=MapFrame(pose_sigma=scene.frame.pose_sigma))
-    scenes = [own if other is scene else other for other in contents.scenes]
+    frame = MapFrame(pose_sigma=scene.frame.pose_sigma)
+    scenes = list(contents.scenes)
+    scenes[scenes.index(scene)] = replace(scene, frame=frame)
     return Localizer(replace(contents, scenes=scenes), localizer.options)
 
 
@@ -92,9 +96,12 @@ def align_by_gripper(
             images without a board are left out.
     """
     localizer = _in_own_frame(localizer, scene)
-    index = {name: i for i, (name, _) in enumerate(images)}
-    located = [item for item in locate(localizer, images) if item.is_located]
-    located = [item for item in located if item.estimate.scene == scene]
+    located = []
+    rows = []
+    for row, item in enumerate(locate(localizer, images)):
+        if item.is_located and item.estimate.scene == scene:
+            located.append(item)
+            rows.append(row)
     if camera_from_board is not None:
         if not scale_known:
             raise InputError(
@@ -102,16 +109,18 @@ def align_by_gripper(
                 " frame by a camera on the gripper or by touched points"
             )
         # The gripper carries the board, so the board replaces the camera.
-        shown = (item for item in located if item.name in camera_from_board)
-        located = [replace(i, pose=i.pose @ camera_from_board[i.name]) for i in shown]
-    if len(located) < LEAST_IMAGES:
+        shown = [item.name in camera_from_board for item in located]
+        located = list(itertools.compress(located, shown))
+        rows = list(itertools.compress(rows, shown))
+        for i, item in enumerate(located):
+            pose = item.pose @ camera_from_board[item.name]
+            located[i] = replace(item, pose=pose)
+    if len(located) < LEAST_LOCATED:
         raise InputError(
             f"{len(located)} of {len(images)} images were located in {scene}; give at least"
-            f" {LEAST_IMAGES} that show it from places that turn about two axes"
+            f" {LEAST_LOCATED} that show it from places that turn about two axes"
         )
-    base_from_gripper = base_from_gripper[
-        np.array([index[item.name] for item in located])
-    ]
+    base_from_gripper = base_from_gripper[np.array(rows)]
     map_from_camera = SE3.stack([item.pose for item in located])
     names = tuple(item.name for item in located)
     pairs = PosePairs(names, base_from_gripper, map_from_camera.inverse())
@@ -139,7 +148,7 @@ def _frame_covariance(
     """Covariance of the base frame as one motion of it, and sigmas in the middle of the cameras."""
     whole = fit.factor * fit.covariance
     picked = np.r_[6:12, size]
-    own = whole[np.ix_(picked, picked)]
+    of_frame = whole[np.ix_(picked, picked)]
     rotation = similarity.base_from_map.rotation_matrix()
     centre = map_from_camera.translation_m.mean(0)
     arm = similarity.scale * rotation @ centre
@@ -148,10 +157,11 @@ def _frame_covariance(
     slope[:3, 3:6] = -cross_matrix(arm) @ rotation
     slope[3:, 3:6] = rotation
     slope[:3, 6] = arm
-    middle = slope @ own @ slope.T
+    middle = slope @ of_frame @ slope.T
     # Away from the middle of the cameras, an error of scale is an error of position.
-    radius = np.sqrt(((map_from_camera.translation_m - centre) ** 2).sum(1).mean() / 3)
-    middle[:3, :3] += np.eye(3) * own[6, 6] * (similarity.scale * radius) ** 2
+    distance2 = ((map_from_camera.translation_m - centre) ** 2).sum(1)
+    radius = np.sqrt(distance2.mean() / 3)
+    middle[:3, :3] += np.eye(3) * of_frame[6, 6] * (similarity.scale * radius) ** 2
     origin = arm + similarity.base_from_map.translation_m
     return _about(origin, middle), axis_deviation(middle)
 
@@ -174,13 +184,19 @@ def align_by_points(
     """
     localizer = _in_own_frame(localizer, scene)
     images = []
-    own = localizer.contents.scene(scene)
+    learned = localizer.contents.scene(scene)
     for name, image, pixels in picks:
         [item] = locate(localizer, [(name, image)])
         if not item.is_located or item.estimate.scene != scene:
             continue
         # The pose holds for the intrinsics that were estimated with it.
-        camera = item.estimate.camera or cameras_in_scenes(None, image, [own])[0]
+        camera = item.estimate.camera or cameras_in_scenes(None, image, [learned])[0]
+        untouched = [key for key in pixels if key not in points]
+        if untouched:
+            raise InputError(
+                f"{name}: the picks name {few(untouched, points)}, which `points` does not"
+                f" give; it gives {few(list(points))}"
+            )
         touched = np.stack([points[key] for key in pixels])
         picked = np.stack([*pixels.values()])
         images.append(Picks(item.pose, camera, touched, tuple(pixels), picked))
@@ -190,8 +206,9 @@ def align_by_points(
             " two are needed"
         )
     similarity, whole, residual_px = fit_picks(images, scale_known)
+    positions = np.stack([*points.values()])
     middle = np.mean([*points.values()], axis=0)
-    radius = np.sqrt(((np.stack([*points.values()]) - middle) ** 2).sum(1).mean() / 3)
+    radius = np.sqrt(((positions - middle) ** 2).sum(1).mean() / 3)
     covariance = whole[:6, :6].copy()
     covariance[:3, :3] += np.eye(3) * whole[6, 6] * radius**2
     return MapAlignment(
@@ -240,16 +257,17 @@ def fit_picks(
             f"{len(triangulated)} points were picked in two or more images; give at least three,"
             " each in two images from different places"
         )
-    in_map, in_base = (
-        np.stack(side) for side in zip(*triangulated.values(), strict=True)
-    )
+    in_map = np.stack([point for point, _ in triangulated.values()])
+    in_base = np.stack([point for _, point in triangulated.values()])
     start = _umeyama(in_map, in_base, scale_known)
     centre = in_base.mean(0)
     before = start.base_from_map.rotation
     shift = start.base_from_map.translation_m - centre
 
     def moved(small: Array) -> Similarity:
-        growth = 1.0 if scale_known else float(np.exp(small[6]))
+        growth = 1.0
+        if not scale_known:
+            growth = float(np.exp(small[6]))
         rotation = Rotation.from_rotvec(small[3:6])
         translation = rotation.apply(shift) * growth + centre + small[:3]
         return Similarity(SE3.of(rotation * before, translation), start.scale * growth)
@@ -260,23 +278,25 @@ def fit_picks(
     fit = least_squares(
         residuals, np.zeros(6 if scale_known else 7), loss="cauchy", f_scale=2.0
     )
-    off = residuals(fit.x)
-    sigma = max(np.sqrt((off**2).sum() / max(len(off) - len(fit.x), 1)), PICK_SIGMA_PX)
+    rest = residuals(fit.x)
+    count = len(fit.x)
+    freedom = max(len(rest) - count, 1)
+    sigma = max(np.sqrt((rest**2).sum() / freedom), PICK_SIGMA_PX)
     covariance = np.zeros((7, 7))
-    covariance[: len(fit.x), : len(fit.x)] = sigma**2 * np.linalg.inv(
-        fit.jac.T @ fit.jac
-    )
+    information = fit.jac.T @ fit.jac
+    covariance[:count, :count] = sigma**2 * np.linalg.inv(information)
     # From a motion about the points' centre to one about the base's origin.
     slope = np.eye(7)
     slope[:3, 3:6] = cross_matrix(centre)
-    rms = float(np.sqrt((off.reshape(-1, 2) ** 2).sum(1).mean()))
+    rms = float(np.sqrt((rest.reshape(-1, 2) ** 2).sum(1).mean()))
     return moved(fit.x), slope @ covariance @ slope.T, rms
 
 
 def _distances(image: Picks, similarity: Similarity) -> Array:
-    back = similarity.base_from_map.inverse().apply(image.points) / similarity.scale
-    at = image.camera.project(image.map_from_camera.inverse().apply(back))
-    return np.nan_to_num(at - image.pixels, nan=1e3).ravel()
+    in_map = similarity.base_from_map.inverse().apply(image.points) / similarity.scale
+    in_camera = image.map_from_camera.inverse().apply(in_map)
+    pixels = image.camera.project(in_camera)
+    return np.nan_to_num(pixels - image.pixels, nan=1e3).ravel()
 
 
 def _triangulated(images: Sequence[Picks]) -> dict[str, tuple[Array, Array]]:
@@ -313,6 +333,8 @@ def _umeyama(source: Array, target: Array, scale_known: bool) -> Similarity:
             " beside the line too"
         )
     rotation = Rotation.align_vectors(b, a)[0]
-    scale = 1.0 if scale_known else float((b * rotation.apply(a)).sum() / (a**2).sum())
+    scale = 1.0
+    if not scale_known:
+        scale = float((b * rotation.apply(a)).sum() / (a**2).sum())
     shift = target.mean(0) - scale * rotation.apply(source.mean(0))
     return Similarity(SE3.of(rotation, shift), scale)

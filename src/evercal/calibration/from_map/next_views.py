@@ -38,21 +38,33 @@ GRIPPER_NOISE = _covariance(0.1e-3, np.deg2rad(0.02))
 """(6, 6) covariance of a gripper pose about the stated one."""
 CAMERA_NOISE = _covariance(0.3e-3, np.deg2rad(0.03))
 """(6, 6) covariance of a camera pose that an image gives, in the scene."""
-_ROUGH, _UNKNOWN = _covariance(0.05, np.deg2rad(15.0)), _covariance(0.2, np.pi)
-"""Of a `gripper_from_camera` that is roughly known, and of one that is not."""
+_ROUGH = _covariance(0.05, np.deg2rad(15.0))
+"""(6, 6) prior covariance of a `gripper_from_camera` that is roughly known."""
+_UNKNOWN = _covariance(0.2, np.pi)
+"""(6, 6) prior covariance of an unknown `gripper_from_camera`."""
 _ANYWHERE = _covariance(1.0, np.pi)
-"""Of the pose of the scene before any image."""
+"""(6, 6) prior covariance of the pose of the scene."""
 _ANY_SCALE = 1.0
 """Relative standard deviation of the scale of the scene before any image."""
 _OPEN = 1.5
-"""A direction is open if a few images would divide its standard deviation by this: by 7 and 2 for a
-KUKA and a Panda that orbit a board, by 1.04 for the packaged cell."""
-_ADDED, _STEP, _STEPS_M, _TURN_DEG = 4, 0.25, (0.03, 0.2), 15.0
-"""Images of a motion that may close it; its size, in distances of the scene, with bounds."""
-_AT_M, _AHEAD_M = 0.3, 0.5
-"""Distance of the point whose variance counts; distance of the scene before parallel cameras."""
-_APART_M, _APART_DEG = 0.02, 4.0
-"""Poses nearer than both are the same one: errors of an arm repeat where its pose does."""
+"""A direction is poorly observed if four more images reduce its standard deviation by this factor:
+7 and 2 for a KUKA and a Panda that orbit a board, 1.04 for the packaged cell."""
+_ADDED = 4
+"""Number of further images of a motion."""
+_STEP = 0.25
+"""Size of a motion, in distances of the scene."""
+_STEPS_M = (0.03, 0.2)
+"""Least and largest size of a motion, metres."""
+_TURN_DEG = 15.0
+"""Rotation of a motion in place, degrees."""
+_AT_M = 0.3
+"""Distance from the camera of the point whose variance counts, metres."""
+_AHEAD_M = 0.5
+"""Distance of the scene before parallel cameras, metres."""
+_APART_M = 0.02
+"""Poses nearer than this, and than `_APART_DEG`, are one: errors of an arm repeat where it does."""
+_APART_DEG = 4.0
+"""Angle between poses that are one, degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +124,9 @@ class OpenPosition:
         """What to do; by default with the expected standard deviation, or with a stated one."""
         times = 1.0 if stated_mm is None else stated_mm / self.sigma_mm
         along = ", ".join(f"{value:+.2f}" for value in self.direction)
-        now, across, then = (
-            times * s for s in (self.sigma_mm, self.across_mm, self.then_mm)
-        )
+        now = times * self.sigma_mm
+        across = times * self.across_mm
+        then = times * self.then_mm
         return (
             f"the motions leave the position along ({along}) of the gripper open: standard"
             f" deviation {now:.1f} mm, {across:.1f} mm across; {_ADDED} more images {self.motion}"
@@ -149,10 +161,11 @@ def open_position(
         f"{100 * step_m:.0f} cm aside without turning": shift[1:],
         f"turned by {_TURN_DEG:.0f} deg in place": turn,
     }
-    some = recorded[np.linspace(0, len(recorded) - 1, _ADDED).round().astype(int)]
+    rows = np.linspace(0, len(recorded) - 1, _ADDED).round().astype(int)
+    begun = recorded[rows]
     then = {}
     for words, steps in motions.items():
-        moved = some @ SE3.exp(np.concatenate([steps, -steps]))
+        moved = begun @ SE3.exp(np.concatenate([steps, -steps]))
         more = _of_six(known + wrist_information(moved, mount, scene_m).sum(0))
         then[words] = 1000 * float(np.sqrt(np.linalg.eigvalsh(more[:3, :3])[-1]))
     best = min(then, key=then.__getitem__)

@@ -16,10 +16,14 @@ from evercal.calibration.pose_pairs.solve import solve_pose_pairs
 from evercal.errors import InputError
 from evercal.geometry import SE3
 
-LEAST_IMAGES = 5
+LEAST_GRIPS = 5
 """Images that determine the camera and the grip; fewer show only that one of them moved."""
-_SIGMAS, _LEAST_MM, _LEAST_DEG = 5.0, 1.0, 0.1
-"""A grip that differs by more of one of these is another."""
+_SIGMAS = 5.0
+"""A grip that differs by more standard deviations is another."""
+_LEAST_MM = 1.0
+"""Smaller changes of a grip, millimetres, do not count."""
+_LEAST_DEG = 0.1
+"""Smaller rotations of a grip, degrees, do not count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +52,7 @@ def held_again(
     The poses `located` are in the frame of the map, and `base_from_gripper` is (n,).
     """
     rows = [i for i, item in enumerate(located) if item.is_located]
-    if len(rows) < LEAST_IMAGES:
+    if len(rows) < LEAST_GRIPS:
         return None
     items = [located[i] for i in rows]
     pairs = PosePairs(

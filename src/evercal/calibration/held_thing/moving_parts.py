@@ -2,12 +2,12 @@
 
 A pixel that shows the same patch in other images, up to gain and offset, stands still. The rest is
 the thing, the arm, and people. Matches that agree with the gripper's motion locate the thing; a
-window around it makes a thing of a few pixels as large as the encoder needs.
+window around it (`windows`) makes a thing of a few pixels as large as the encoder needs.
 """
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -15,67 +15,68 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.recordings.frame import Frame
+from evercal.recordings.images import Picture, StoredImage, pixels_of
 from evercal.recordings.masks import without
-from evercal.typing import BoolArray
+from evercal.typing import BoolArray, Float32Array, Image
 
-PATCH_PX, SAME, STILL_IN, LEAST_CONTRAST = 9, 0.8, 2, 2.0
-"""Side of a patch; correlation of equal patches; other images that show a patch where it stands
-still; least variance of a patch that shows something, in variances of the noise."""
+PATCH_PX = 9
+"""Side of a patch."""
+LEAST_CORRELATION = 0.8
+"""Patches with a larger correlation are equal."""
+STILL_IMAGES = 2
+"""Number of other images that repeat a patch which stands still."""
+LEAST_CONTRAST = 2.0
+"""Least variance of a textured patch, in variances of the noise."""
 COMPARED = 40
-"""Images that each one is compared with, about."""
+"""Approximate number of images that each one is compared with."""
 LEAST_NOISE = 2.0
-"""Standard deviation of intensities that every camera has at least."""
+"""Least standard deviation of the intensities of any camera."""
 LONG_SIDE = 640
-"""Images are compared at this size, pixels."""
-MARGIN = 1.2
-"""Side of the window around a thing, as a factor."""
-MOST_WINDOW = 0.75
-"""Windows larger than this share of the image are not worth it."""
+"""Long side at which images are compared, pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class MovingPart(StoredImage):
+    """An image without what stands still; it is read again each time."""
+
+    image: Picture
+    moving: BoolArray
+    """(h, w) what to keep, at the size at which images are compared."""
+
+    def read(self) -> Image:
+        """Decode the image to (H, W, 3) uint8 RGB."""
+        return without(pixels_of(self.image), self.moving)
 
 
 def moving_parts(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], float]:
     """The frames without what stands still, and the share of their texture that stands still."""
-    images = [frame.read_image() for frame in frames]
-    scale = min(1.0, LONG_SIDE / max(images[0].shape[:2]))
-    greys = [
-        cv2.resize(
-            cv2.cvtColor(image, cv2.COLOR_RGB2GRAY),
-            None,
-            None,
-            scale,
-            scale,
-            cv2.INTER_AREA,
-        )
-        for image in images
-    ]
-    still, textured = _still(greys)
+    still, textured = _still([_compared(frame) for frame in frames])
     share = float((still & textured).sum() / max(textured.sum(), 1))
-    return tuple(
-        replace(frame, image=without(image, _opened(~stands & visible)))
-        for frame, image, stands, visible in zip(
-            frames, images, still, textured, strict=True
-        )
-    ), share
+    moving = []
+    for frame, stands, visible in zip(frames, still, textured, strict=True):
+        image = MovingPart(frame.image, _opened(~stands & visible))
+        moving.append(replace(frame, image=image))
+    return tuple(moving), share
 
 
-def _still(
-    greys: Sequence[NDArray[Any]],
-) -> tuple[BoolArray, BoolArray]:
+def _compared(frame: Frame) -> NDArray[Any]:
+    """The image in grey, at the size at which images are compared."""
+    image = frame.read_image()
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    scale = min(1.0, LONG_SIDE / max(image.shape[:2]))
+    return cv2.resize(grey, None, None, scale, scale, cv2.INTER_AREA)
+
+
+def _still(greys: Sequence[NDArray[Any]]) -> tuple[BoolArray, BoolArray]:
     """(n, h, w) whether a patch is repeated at its place, and whether it shows anything."""
     size = (PATCH_PX, PATCH_PX)
     images = [grey.astype(np.float32) for grey in greys]
     means = [cv2.blur(image, size) for image in images]
-    variances = np.stack(
-        [
-            np.maximum(cv2.blur(i * i, size) - m * m, 0)
-            for i, m in zip(images, means, strict=True)
-        ]
-    )
+    variances = np.stack([_variance(image) for image in images])
     # Most of two images is equal but for the noise.
-    changes = [
-        float(np.median(cv2.blur((b - a) ** 2, size) - cv2.blur(b - a, size) ** 2)) / 2
-        for a, b in itertools.pairwise(images)
-    ]
+    changes = []
+    for before, after in itertools.pairwise(images):
+        changes.append(float(np.median(_raw_variance(after - before))) / 2)
     noise = max(float(np.median(changes)), LEAST_NOISE**2)
     signals = np.maximum(variances - noise, noise)
     apart = -(-len(images) // COMPARED)
@@ -83,17 +84,26 @@ def _still(
     for i, image in enumerate(images):
         for j in range(i % apart, i, apart):
             covariance = cv2.blur(image * images[j], size) - means[i] * means[j]
-            same = covariance > SAME * np.sqrt(signals[i] * signals[j])
-            repeated[i] += same
-            repeated[j] += same
-    return repeated >= STILL_IN, variances > (1 + LEAST_CONTRAST) * noise
+            equal = covariance > LEAST_CORRELATION * np.sqrt(signals[i] * signals[j])
+            repeated[i] += equal
+            repeated[j] += equal
+    return repeated >= STILL_IMAGES, variances > (1 + LEAST_CONTRAST) * noise
+
+
+def _variance(image: Float32Array) -> Float32Array:
+    """Variance of the patch around each pixel."""
+    size = (PATCH_PX, PATCH_PX)
+    mean = cv2.blur(image, size)
+    return np.maximum(cv2.blur(image * image, size) - mean * mean, 0)
+
+
+def _raw_variance(change: Float32Array) -> Float32Array:
+    size = (PATCH_PX, PATCH_PX)
+    return cv2.blur(change**2, size) - cv2.blur(change, size) ** 2
 
 
 def _opened(moving: BoolArray) -> BoolArray:
     """Without single pixels."""
-    return (
-        cv2.morphologyEx(
-            moving.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
-        )
-        > 0
-    )
+    pixels = moving.astype(np.uint8)
+    kernel = np.ones((3, 3), np.uint8)
+    return cv2.morphologyEx(pixels, cv2.MORPH_OPEN, kernel) > 0

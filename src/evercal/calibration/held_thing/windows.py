@@ -5,11 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from evercal.calibration.from_map.hand_eye_start import (
-    HandEyeStart,
-    ImagePair,
-    scene_from_parent,
-)
+from evercal.calibration.from_map.hand_eye_start import HandEyeStart, scene_from_parent
+from evercal.calibration.from_map.image_pairs import ImagePair
 from evercal.calibration.held_thing.moving_parts import PATCH_PX
 from evercal.geometry import SE3
 from evercal.recordings.frame import Frame
@@ -17,9 +14,11 @@ from evercal.robot.mount import EYE_TO_HAND
 from evercal.typing import Array, IntArray
 
 MARGIN = 1.2
-"""Side of the window around a thing, as a factor."""
+"""Side of a window, in sides of the thing."""
 MOST_WINDOW = 0.75
-"""Windows larger than this share of the image are not worth it."""
+"""Largest side of a window, in short sides of the image; larger ones are not worth it."""
+STRAY = 4.0
+"""Points farther from the median than this many median distances are outliers."""
 
 
 def windows(frames: Sequence[Frame], start: HandEyeStart) -> IntArray | None:
@@ -28,8 +27,9 @@ def windows(frames: Sequence[Frame], start: HandEyeStart) -> IntArray | None:
     points = _points(poses, start.matches)
     if not len(points):
         return None
-    inner = np.abs(points - np.median(points, 0))
-    points = points[(inner < 4 * np.median(inner, 0) + 1e-6).all(1)]
+    distance = np.abs(points - np.median(points, 0))
+    is_near = distance < STRAY * np.median(distance, 0) + 1e-6
+    points = points[is_near.all(1)]
     low = []
     high = []
     for frame, pose in zip(frames, poses, strict=True):
@@ -49,12 +49,15 @@ def windows(frames: Sequence[Frame], start: HandEyeStart) -> IntArray | None:
 def cropped(frame: Frame, window: IntArray) -> Frame:
     """The part of a frame in a window."""
     left, top, side = window.tolist()
-    camera = frame.camera
-    image = frame.read_image()[top : top + side, left : left + side]
-    part = replace(
-        camera, width=side, height=side, cx=camera.cx - left, cy=camera.cy - top
+    camera = replace(
+        frame.camera,
+        width=side,
+        height=side,
+        cx=frame.camera.cx - left,
+        cy=frame.camera.cy - top,
     )
-    return replace(frame, image=np.ascontiguousarray(image), camera=part)
+    image = frame.read_image()[top : top + side, left : left + side]
+    return replace(frame, image=np.ascontiguousarray(image), camera=camera)
 
 
 def _points(poses: SE3, pairs: Sequence[ImagePair]) -> Array:
@@ -71,8 +74,7 @@ def _points(poses: SE3, pairs: Sequence[ImagePair]) -> Array:
         aa = (a * a).sum(1)
         ab = (a * b).sum(1)
         bb = (b * b).sum(1)
-        along = (bb * (a @ between) - ab * (b @ between)) / np.maximum(
-            aa * bb - ab**2, 1e-9
-        )
+        determinant = np.maximum(aa * bb - ab**2, 1e-9)
+        along = (bb * (a @ between) - ab * (b @ between)) / determinant
         points.append(first[:3, 3] + a * along[:, None])
     return np.concatenate(points)

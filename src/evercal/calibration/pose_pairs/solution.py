@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.intrinsics import LENS, moved_lens
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse
+from evercal.calibration.checks import PairChecks
 from evercal.calibration.pose_pairs.checks import (
     held_out_error,
     left_open,
@@ -110,7 +111,7 @@ class PairSolution:
             camera=self.camera,
             images=self._images(),
             error_terms=self._error_terms(),
-            checks=self._checks(time_offset_s),
+            checks=PairChecks(**self._checks(time_offset_s)),
             created=datetime.now(UTC).isoformat(timespec="seconds"),
         )
         return replace(calibration, verdict=verdict(calibration))

@@ -3,7 +3,7 @@
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -154,7 +154,7 @@ class _MapRun(_Run):
                 memory = self.stage.memory
                 size = memory.bytes or f"{100 * memory.share:g}%"
                 scene, report = learn_scene(self.scenes[number], contents, size)
-                opened.commit(scene, asdict(report))
+                opened.commit(scene, report.stored())
             name = self.strategy.name
             named = {
                 name: Localizer(contents),

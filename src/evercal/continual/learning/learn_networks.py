@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from evercal.continual.learning.learn import learn
@@ -14,7 +14,7 @@ from evercal.continual.store import NetworkStore, head_bytes
 from evercal.continual.strategies import Strategy, strategy_named
 from evercal.continual.threshold import fit_threshold
 from evercal.errors import InputError
-from evercal.learning.scene import LearnReport
+from evercal.learning.report import LearnReport
 from evercal.recordings.frame import (
     Frame,
     Recording,
@@ -23,6 +23,16 @@ from evercal.recordings.frame import (
 )
 from evercal.recordings.held_out import named_recording, require_frames, split_held_out
 from evercal.storage.stages import is_store
+
+
+@dataclass(frozen=True)
+class NetworkReport(LearnReport):
+    """Outcome of learning a scene into networks."""
+
+    iterations: int = 0
+    """Training steps."""
+    head_bytes: int = 0
+    """Size of the networks."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +115,7 @@ def learn_networks(
     recording: Recording,
     options: NetworkLearnOptions,
     on_event: OnEvent = unobserved,
-) -> LearnReport:
+) -> NetworkReport:
     """Learn a scene into a store; an interrupted call leaves the store at its last scene.
 
     Args:
@@ -144,7 +154,7 @@ def learn_networks(
         train = replace(recording, train=split.train)
         learned = learn(contents, strategy.method, train, stage, on_event)
         learned.scenes[-1] = fit_threshold(learned, split.held_out)
-        report = LearnReport(
+        report = NetworkReport(
             scene=recording.name,
             seconds=time.perf_counter() - began,
             memory_bytes=learned.memory_bytes,
@@ -154,5 +164,5 @@ def learn_networks(
             iterations=stage.fit.iterations,
             head_bytes=sum(map(head_bytes, learned.heads)),
         )
-        opened.commit(learned, asdict(report))
+        opened.commit(learned, report.to_dict())
     return report

@@ -20,8 +20,6 @@ from evercal.typing import Array
 
 Fields = Mapping[str, Any]
 """Values by name."""
-Size = tuple[int, int]
-"""Width and height, pixels."""
 
 
 def _by_alias(table: str) -> dict[str, str]:
@@ -111,7 +109,7 @@ def named_fields(data: Fields) -> dict[str, Any]:
     return {name: data[key] for name, key in keys.items()}
 
 
-def camera_of(data: Fields, size: Size | None) -> Camera:
+def camera_of(data: Fields, size: tuple[int, int] | None) -> Camera:
     """One camera from its fields.
 
     `size` is (width, height) in pixels of images, for fields without a size. ValueError: they are
@@ -119,8 +117,7 @@ def camera_of(data: Fields, size: Size | None) -> Camera:
     """
     fields = named_fields(data)
     roi = data.get("roi")
-    offset = isinstance(roi, dict) and (roi.get("x_offset") or roi.get("y_offset"))
-    if offset:
+    if isinstance(roi, dict) and (roi.get("x_offset") or roi.get("y_offset")):
         raise ValueError(
             f"the image is a cut-out (roi {roi}); give the whole image's camera_info"
         )
@@ -161,8 +158,7 @@ def camera_of(data: Fields, size: Size | None) -> Camera:
 
 def _model_kind(model: object) -> str:
     """A value of `_MODELS`; `zero` for models that are read without distortion only, else empty."""
-    _, _, name = str(model).rpartition(".")
-    plain = re.sub(r"[\s_-]", "", name.lower())
+    plain = re.sub(r"[\s_-]", "", str(model).rpartition(".")[2].lower())
     kind = _MODELS.get(plain, "")
     if not kind and "conrady" in plain:
         # RealSense prints distortion.inverse_brown_conrady, mostly with zeros.
@@ -174,8 +170,7 @@ def _of_radial_model(kind: str, fields: Fields, size: tuple[Any, Any]) -> Camera
     """As Kalibr states it: parameters before the focal lengths, or the one of `fov` after them."""
     numbers = numbers_of(fields.get("camera_matrix"), "intrinsics")
     name = "distortion_coefficients"
-    values = fields.get(name, [])
-    distortion = numbers_of(values, name)
+    distortion = numbers_of(fields.get(name, []), name)
     if kind == "fov":
         numbers = [*distortion, *numbers]
         distortion = []
@@ -193,8 +188,7 @@ def _of_radial_model(kind: str, fields: Fields, size: tuple[Any, Any]) -> Camera
 def _distortion(fields: Fields, model: str) -> tuple[float, ...] | None:
     """Coefficients in OpenCV's order; None if there is no field of them."""
     names = COEFFICIENTS[model]
-    stated = [name for name in _PINHOLE if fields.get(name)]
-    others = [name for name in stated if name not in names]
+    others = [name for name in _PINHOLE if fields.get(name) and name not in names]
     if others:
         raise ValueError(
             f"a fisheye has {', '.join(names)}, got {', '.join(others)}; leave others out"
@@ -212,8 +206,7 @@ def _distortion(fields: Fields, model: str) -> tuple[float, ...] | None:
     else:
         return None
     # Longer models add terms that are mostly zero and can then be dropped.
-    lengths = _LENGTHS[model]
-    while len(numbers) not in lengths and numbers[-1] == 0:
+    while len(numbers) not in _LENGTHS[model] and numbers[-1] == 0:
         numbers.pop()
     return tuple(numbers)
 
@@ -235,21 +228,13 @@ def _matrix(fields: Fields, data: Fields) -> Array:
     names = ("fx", "fy", "cx", "cy")
     if "camera_matrix" in fields:
         numbers = numbers_of(fields["camera_matrix"], "camera_matrix")
-        if len(numbers) == 4:
-            fx, fy, cx, cy = numbers
-            # As Kalibr writes it; other orders differ in the first two.
-            if 0.8 * fy < fx < 1.25 * fy:
-                return _matrix_of(fx, fy, cx, cy)
-        if len(numbers) == 16:
-            whole = np.reshape(numbers, (4, 4))
-            last = [0, 0, 0, 1]
-            if numbers[12:] == last and numbers[3::4] == last:
-                numbers = whole[:3, :3].ravel().tolist()
-        numbers = numbers_of(numbers, "camera_matrix", 9)
-        matrix = np.reshape(numbers, (3, 3))
-        last_row = matrix[2, :2]
-        last_column = matrix[:2, 2]
-        if last_row.any() and not last_column.any():
+        # As Kalibr writes it; other orders differ in the first two.
+        if len(numbers) == 4 and 0.8 * numbers[1] < numbers[0] < 1.25 * numbers[1]:
+            return _matrix_of(*numbers)
+        if len(numbers) == 16 and numbers[3::4] == numbers[12:] == [0, 0, 0, 1]:
+            numbers = np.reshape(numbers, (4, 4))[:3, :3].ravel().tolist()
+        matrix = np.reshape(numbers_of(numbers, "camera_matrix", 9), (3, 3))
+        if matrix[2, :2].any() and not matrix[:2, 2].any():
             return matrix.T  # Open3D writes it column after column.
         return matrix
     missing = [name for name in names if name not in fields]
@@ -257,22 +242,19 @@ def _matrix(fields: Fields, data: Fields) -> Array:
         problem = "'camera_matrix' is missing"
         if len(missing) < len(names):
             problem = f"camera {missing[0]!r} is missing"
-        stated = _keys(data) or "nothing"
-        raise ValueError(f"{problem}, there is {stated}; {EXPECTED}")
-    values = [fields[name] for name in names]
-    return _matrix_of(*numbers_of(values, "fx, fy, cx, cy", 4))
+        raise ValueError(f"{problem}, there is {_keys(data) or 'nothing'}; {EXPECTED}")
+    return _matrix_of(
+        *numbers_of([fields[name] for name in names], "fx, fy, cx, cy", 4)
+    )
 
 
 def _matrix_of(fx: float, fy: float, cx: float, cy: float) -> Array:
-    matrix = np.eye(3)
-    matrix[0, 0] = fx
-    matrix[1, 1] = fy
-    matrix[0, 2] = cx
-    matrix[1, 2] = cy
-    return matrix
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
-def _size(fields: Fields, data: Fields, size: Size | None) -> tuple[Any, Any]:
+def _size(
+    fields: Fields, data: Fields, size: tuple[int, int] | None
+) -> tuple[Any, Any]:
     """Width and height in pixels, or `size` if no field states either."""
     missing = [name for name in ("image_width", "image_height") if name not in fields]
     stated = fields.get("image_size")
@@ -300,25 +282,23 @@ def _refuse_unknown(data: Fields) -> None:
         if isinstance(value, Mapping):
             value = value.get("data")
         cells = np.ravel(np.array(value, dtype=object)).tolist()
-        if not all(map(is_number, cells)) or not any(map(float, cells)):
-            continue
-        if _is_matrix(key, value, len(cells)):
-            continue
-        raise ValueError(
-            f"{key!r} is not known and may change the image; name distortion k1, k2, p1, p2, k3, or"
-            f" distortion_coefficients in this order, and leave other numbers out"
-        )
+        numeric = all(map(is_number, cells))
+        if numeric and any(map(float, cells)) and not _is_matrix(key, value, cells):
+            raise ValueError(
+                f"{key!r} is not known and may change the image; name distortion k1, k2, p1, p2,"
+                f" k3, or distortion_coefficients in this order, and leave other numbers out"
+            )
 
 
-def _is_matrix(key: object, value: object, count: int) -> bool:
+def _is_matrix(key: object, value: object, cells: list[Any]) -> bool:
     """Whether numbers are a 3x3 or 4x4 matrix, or P of ROS, or another one in rows."""
-    if count in (9, 16):
+    if len(cells) in (9, 16):
         return True
-    if count == 12 and _plain(key) == "p":
+    if len(cells) == 12 and _plain(key) == "p":
         return True
     if not isinstance(value, list) or len(value) < 3:
         return False
-    return min(map(np.size, value)) > 2
+    return all(np.size(row) > 2 for row in value)
 
 
 def _binned(camera: Camera, fields: Fields) -> Camera:
@@ -330,15 +310,12 @@ def _binned(camera: Camera, fields: Fields) -> Camera:
 
 def _refuse_misfit(camera: Camera) -> None:
     """Refuse short focal lengths, and principal points outside of the image."""
-    focal = min(camera.fx, camera.fy)
-    inside_x = 0 <= camera.cx <= camera.width
-    inside_y = 0 <= camera.cy <= camera.height
-    if inside_x and inside_y and focal >= camera.width / 10:
+    inside = 0 <= camera.cx <= camera.width and 0 <= camera.cy <= camera.height
+    if inside and min(camera.fx, camera.fy) >= camera.width / 10:
         return
-    numbers = f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}"
     raise ValueError(
-        f"{numbers} do not fit {camera.width}x{camera.height} images; give them in pixels and of"
-        f" this image size"
+        f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} do not fit"
+        f" {camera.width}x{camera.height} images; give them in pixels and of this image size"
     )
 
 
@@ -355,14 +332,12 @@ def numbers_of(value: Any, name: str, count: int | None = None) -> list[float]:
     if isinstance(value, dict):
         value = value.get("data")
     try:
-        if not isinstance(value, list) or bool in map(type, value):
+        if not isinstance(value, list) or any(isinstance(v, bool) for v in value):
             raise TypeError
         # YAML 1.1 reads 1e-05, as written by ROS, as a word.
-        array = np.array(value, dtype=np.float64)
-        numbers = array.ravel().tolist()
+        numbers = np.array(value, dtype=np.float64).ravel().tolist()
     except (TypeError, ValueError):
         raise ValueError(f"'{name}' is a list of numbers, got {value!r}") from None
     if count is not None and len(numbers) != count:
-        problem = f"{name} has {count} numbers, got {len(numbers)}"
-        raise ValueError(f"{problem}; {EXPECTED}")
+        raise ValueError(f"{name} has {count} numbers, got {len(numbers)}; {EXPECTED}")
     return numbers

@@ -15,7 +15,6 @@ from evercal.recordings.cameras.camera_fields import (
     DISTORTION,
     EXPECTED,
     Fields,
-    Size,
     camera_of,
     field_name,
     named_fields,
@@ -28,7 +27,7 @@ _OF_ONE_CAMERA = ("camera_matrix", "fx", "fy", "cx", "cy")
 """Fields that do not hold for the cameras inside an entry."""
 
 
-def read_camera(path: PathLike, size: Size | None = None) -> Camera:
+def read_camera(path: PathLike, size: tuple[int, int] | None = None) -> Camera:
     """Read the intrinsics of one camera.
 
     `size` is (width, height) of the images in pixels, for files without one.
@@ -38,14 +37,14 @@ def read_camera(path: PathLike, size: Size | None = None) -> Camera:
         return camera_from_fields(fields_of(path, size), size)
 
 
-def read_camera_of_size(path: Path, size: Size, images: str) -> Camera:
+def read_camera_of_size(path: Path, size: tuple[int, int], images: str) -> Camera:
     """Read the intrinsics of images of one size; another size is refused."""
     camera = read_camera(path, size)
     check_size(str(path), camera, size, images)
     return camera
 
 
-def check_size(source: str, camera: Camera, size: Size, images: str) -> None:
+def check_size(source: str, camera: Camera, size: tuple[int, int], images: str) -> None:
     """Raise `InputError` if a camera from `source` has another size than its images."""
     if (camera.width, camera.height) != size:
         raise InputError(
@@ -54,7 +53,7 @@ def check_size(source: str, camera: Camera, size: Size, images: str) -> None:
         )
 
 
-def camera_from_fields(data: Fields, size: Size | None = None) -> Camera:
+def camera_from_fields(data: Fields, size: tuple[int, int] | None = None) -> Camera:
     """Build a camera from the fields of a file, or of a ROS message.
 
     The camera may stand inside other fields. Of several, the only one of the images' size is taken.
@@ -93,9 +92,7 @@ def _undotted(data: Fields) -> dict[str, Any]:
         if key == "Camera.type":
             name = "camera_model"
         groups.setdefault(group, {})[name] = value
-    plain = groups.pop("")
-    for_all = groups.pop("Camera")
-    return {**plain, **for_all, **groups}
+    return {**groups.pop(""), **groups.pop("Camera"), **groups}
 
 
 def _entries(data: Fields, around: Fields, name: str) -> Iterator[tuple[str, Fields]]:
@@ -106,8 +103,7 @@ def _entries(data: Fields, around: Fields, name: str) -> Iterator[tuple[str, Fie
     if not hidden.isdisjoint(DISTORTION):
         hidden.update(DISTORTION)
     around = {key: value for key, value in around.items() if key not in hidden}
-    matrix = fields.get("camera_matrix")
-    if "fx" in fields or isinstance(matrix, list | dict):
+    if "fx" in fields or isinstance(fields.get("camera_matrix"), list | dict):
         yield name, {**around, **data}
     for key, value in fields.items():
         if key not in _OF_ONE_CAMERA:
@@ -139,7 +135,7 @@ def _inside(data: Fields, name: str) -> Iterator[tuple[str, Fields]]:
                     yield f"{inner}[{i}]", entry
 
 
-def fields_of(path: Path, size: Size | None = None) -> Fields:
+def fields_of(path: Path, size: tuple[int, int] | None = None) -> Fields:
     """Entries of a camera file, as written; ValueError for other files.
 
     A focal length alone has its principal point in the middle of images of `size`.
@@ -151,16 +147,15 @@ def fields_of(path: Path, size: Size | None = None) -> Fields:
     text = read_text(path, "camera file")
     words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
     if all(map(is_number, words)):
-        numbers = [*map(float, words)]
+        numbers = [float(word) for word in words]
         if len(numbers) == 1 and size is not None:
             numbers = _centred(numbers[0], *size)
         return {"camera_matrix": numbers}
     try:
         if "<opencv_storage" in text:
             return _of_xml(text)
-        is_json = text.lstrip().startswith("{")
         # A printed message ends with '---', which opens a second, empty document.
-        data, *_ = [*documents(text, is_json), None]
+        data = next(iter(documents(text, text.lstrip().startswith("{"))), None)
     except ValueError as error:
         raise ValueError(f"{error}; {EXPECTED}") from None
     if not isinstance(data, dict):
@@ -192,15 +187,14 @@ def _xml_value(element: Any) -> Any:
     if data is not None:
         return {"data": (data.text or "").split()}
     if len(element):
-        values = [*map(_xml_value, element)]
-        tags = [child.tag for child in element]
-        if tags[0] == "_":
-            return values
-        return dict(zip(tags, values, strict=True))
+        values = [(child.tag, _xml_value(child)) for child in element]
+        if values[0][0] == "_":
+            return [value for _, value in values]
+        return dict(values)
     words = (element.text or "").split()
     if not words or not all(map(is_number, words)):
         return " ".join(words)
-    numbers = [*map(float, words)]
+    numbers = [float(word) for word in words]
     if len(numbers) == 1:
         return numbers[0]
     return numbers

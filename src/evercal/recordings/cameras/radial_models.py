@@ -31,8 +31,7 @@ class RadialModel(NamedTuple):
 def _fov(angle: Array, omega: float) -> Array:
     if not omega:
         return np.tan(angle)
-    half = np.tan(omega / 2)
-    return np.arctan(2 * np.tan(angle) * half) / omega
+    return np.arctan(2 * np.tan(angle) * np.tan(omega / 2)) / omega
 
 
 def _omni(angle: Array, xi: float) -> Array:
@@ -42,17 +41,15 @@ def _omni(angle: Array, xi: float) -> Array:
 def _eucm(angle: Array, alpha: float, beta: float) -> Array:
     cosine = np.cos(angle)
     sine = np.sin(angle)
-    squared = beta * sine**2 + cosine**2
-    depth = alpha * np.sqrt(squared) + (1 - alpha) * cosine
-    return sine / depth
+    distance = np.sqrt(beta * sine**2 + cosine**2)
+    return sine / (alpha * distance + (1 - alpha) * cosine)
 
 
 def _ds(angle: Array, xi: float, alpha: float) -> Array:
     sine = np.sin(angle)
     shifted = xi + np.cos(angle)
     distance = np.sqrt(sine**2 + shifted**2)
-    depth = alpha * distance + (1 - alpha) * shifted
-    return sine / depth
+    return sine / (alpha * distance + (1 - alpha) * shifted)
 
 
 RADIAL_MODELS = {
@@ -79,20 +76,17 @@ def nearest_fisheye(
         ValueError: No fisheye is within `MAX_ERROR_PX`.
     """
     radius = RADIAL_MODELS[name].radius
-    last_pixel = np.array(size) - 1
-    corner = np.maximum(centre, last_pixel - centre)
-    largest = np.hypot(*(corner / focal)) * 1.01
+    corner = np.maximum(centre, np.array(size) - 1 - centre) / focal
+    largest = np.hypot(*corner) * 1.01
     angles = np.deg2rad(np.linspace(0.05, FISHEYE_DEG, 400))
     radii = radius(angles, *parameters)
-    steps = np.diff(radii, append=np.inf)
-    rising = np.logical_and.accumulate(steps > 0)
+    rising = np.cumprod(np.diff(radii, append=np.inf) > 0).astype(bool)
     in_image = rising & np.isfinite(radii) & (radii <= largest)
     angles = angles[in_image]
     radii = radii[in_image]
     powers = angles[:, None] ** np.arange(1, 10, 2)
     terms = np.linalg.lstsq(powers, radii, rcond=None)[0]
-    residuals = powers @ terms - radii
-    error = np.abs(residuals).max() * max(focal)
+    error = np.abs(powers @ terms - radii).max() * max(focal)
     if not error < MAX_ERROR_PX:
         raise ValueError(
             f"no fisheye is nearer than {error:.1f} px to this {name} model"

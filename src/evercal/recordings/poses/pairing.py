@@ -233,6 +233,4 @@ def _image_times(
 
 
 def _count(number: int, what: str) -> str:
-    if number != 1:
-        what += "s"
-    return f"{number} {what}"
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"

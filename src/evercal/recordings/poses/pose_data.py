@@ -208,9 +208,7 @@ def _keys_of_images(data: Columns) -> list[str]:
 
 def _refuse_eye_on_base(data: Columns, given: Given) -> None:
     parameters = data.get("parameters")
-    if not isinstance(parameters, Mapping):
-        return
-    if given and given.has("inverse"):
+    if not isinstance(parameters, Mapping) or (given and given.has("inverse")):
         return
     on_base = parameters.get("calibration_type") == "eye_on_base"
     if on_base or parameters.get("eye_on_hand") is False:
@@ -280,8 +278,7 @@ def _of_arrays(columns: Columns, given: Given, plural: bool) -> PoseTable | None
 
 def _are_poses(key: str, shape: Shape, plural: bool) -> bool:
     """Whether an array of a shape holds matrices, or rows of numbers other than joint values."""
-    are_matrices = shape[-2:] in _MATRICES or shape[:2] in _MATRICES
-    if are_matrices:
+    if shape[-2:] in _MATRICES or shape[:2] in _MATRICES:
         return True
     is_table = len(shape) == 2 and shape[1] in _WIDTHS
     return plural and is_table and "joint" not in key.lower()
@@ -336,10 +333,8 @@ def _composed(
 def _rows(array: Array, width: int) -> Array:
     """(n, width) numbers of arrays with an axis too many, or with the poses last as in MATLAB."""
     array = np.squeeze(array)
-    if array.ndim == 2:
-        height, columns = array.shape
-        if height == width != columns:
-            array = array.T
+    if array.ndim == 2 and array.shape[1] != width == array.shape[0]:
+        array = array.T
     return array.reshape(-1, width)
 
 
@@ -411,8 +406,7 @@ def _cells(row: Columns) -> dict[str, object]:
     """One value a column: those of a list are columns of their own."""
     cells: dict[str, object] = {}
     for key, value in row.items():
-        order = key[-4:].lower()
-        names = _LISTS.get(key) or _QUATERNIONS.get(order)
+        names = _LISTS.get(key) or _QUATERNIONS.get(key[-4:].lower())
         values = value
         if not isinstance(value, list):
             values = [value]

@@ -1,0 +1,262 @@
+"""A camera from nothing: images and gripper poses give `gripper_from_camera` or `base_from_camera`.
+
+A camera on the gripper sees a scene that stands still. A fixed camera sees a thing that the
+gripper holds: `gripper_from_base` moves the camera around it, so it is the same problem in the
+frame of the gripper. `hand_eye_start` estimates a first transform from pairs of images. The map's
+bundle adjustment refines it together with all poses and landmarks.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from evercal.calibration.calibration import Calibration, ErrorTerm
+from evercal.calibration.checks import LearnedChecks
+from evercal.calibration.framed_pose import ImageUse, JointOffset
+from evercal.calibration.from_map.hand_eye_start import HandEyeStart
+from evercal.calibration.from_map.next_views import open_position
+from evercal.calibration.located import length_mm_deg
+from evercal.calibration.verdict import verdict
+from evercal.geometry import SE3, UncertainPose, pose_distance_mm_deg
+from evercal.mapping.built_map import Adjusted, BuiltMap
+from evercal.recordings.frame import Frame, stated_grippers
+from evercal.robot.arm_offsets import ArmOffsets
+
+MOST_FOCAL_PERCENT = 1.0
+"""A larger change of the focal length indicates errors that the covariance does not contain."""
+MOST_POSE_SIGMA_MM = 5.0
+"""The same of the standard deviation of gripper positions, millimetres."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandEye:
+    """A calibration from images and gripper poses alone, and how it was estimated."""
+
+    calibration: Calibration
+    """gripper_from_camera, or base_from_camera of a fixed camera."""
+    pairs: int
+    """Pairs of frames whose motion agrees with the first estimate."""
+    of_pairs: int
+    """Pairs of frames that the first estimate was made from."""
+    start_mm: float
+    """Change of the position of the first estimate by bundle adjustment."""
+    start_deg: float
+    """Change of its rotation."""
+    given_mm: float | None = None
+    """Distance from a given `gripper_from_camera`, such as from CAD."""
+    given_deg: float | None = None
+    warnings: tuple[str, ...] = ()
+    """Reasons not to rely on the estimate."""
+    advice: str = ""
+    """Images that would improve it most; empty if no direction of the position is open."""
+
+    @property
+    def parent_from_camera(self) -> UncertainPose:
+        """The transform with its covariance."""
+        return self.calibration.uncertain_pose
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON values, as `evercal learn --json` prints them."""
+        calibration = self.calibration
+        pose = calibration.parent_from_child
+        checks = calibration.checks
+        return {
+            "translation_m": pose.translation_m.tolist(),
+            "quaternion_wxyz": pose.rotation_wxyz.tolist(),
+            "covariance": calibration.covariance.tolist(),
+            "pairs": self.pairs,
+            "of_pairs": self.of_pairs,
+            "start_mm": self.start_mm,
+            "start_deg": self.start_deg,
+            "mount": calibration.mount,
+            "map": calibration.source["map"],
+            "image_scatter": checks.image_scatter or [],
+            "images_located": checks.images_used or 0,
+            "given_mm": self.given_mm,
+            "given_deg": self.given_deg,
+            "warnings": list(self.warnings),
+            "advice": self.advice,
+            "created": calibration.created,
+            "error_terms": [asdict(term) for term in calibration.error_terms],
+            "images": [asdict(image) for image in calibration.images],
+            "joints": [asdict(joint) for joint in calibration.joints],
+            "joint_covariance": calibration.joint_covariance.tolist(),
+            "joints_move_mm": checks.joints_move_mm or [],
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any], calibration: Calibration) -> Self:
+        """The inverse of `to_dict`, beside the calibration that is stored with the scene."""
+        return cls(
+            calibration,
+            values["pairs"],
+            values["of_pairs"],
+            values["start_mm"],
+            values["start_deg"],
+            values["given_mm"],
+            values["given_deg"],
+            tuple(values["warnings"]),
+            values["advice"],
+        )
+
+
+def hand_eye_of(
+    start: HandEyeStart,
+    built: BuiltMap,
+    frames: Sequence[Frame],
+    given: SE3 | None = None,
+) -> HandEye:
+    """Return the estimate of a map that was built from `frames` with `MapOptions.for_hand_eye`.
+
+    `given` is `gripper_from_camera` from another source, to compare with.
+    """
+    correction = built.hand_eye
+    assert correction is not None, "the map was built for a hand-eye calibration"
+    # The covariance of the correction is about camera axes, as that of a pose after an exact one.
+    start_from_camera = UncertainPose(
+        correction.start_camera_from_camera, correction.covariance
+    )
+    estimate = start.parent_from_camera @ start_from_camera
+    start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.parent_from_camera)
+    given_mm = None
+    given_deg = None
+    if given is not None:
+        given_mm, given_deg = pose_distance_mm_deg(estimate.pose, given)
+    terms = (
+        ErrorTerm.of("noise of images and gripper poses", correction.by_noise),
+        ErrorTerm.of("intrinsics", correction.by_lens),
+        ErrorTerm.of("slowly varying errors of gripper poses", correction.by_drift),
+    )
+    calibration = Calibration(
+        start.mount.name,
+        estimate.pose,
+        estimate.covariance,
+        parent_frame=start.mount.parent,
+        camera=built.scene.adjusted_camera,
+        images=_uses(frames, built),
+        error_terms=terms,
+        source={
+            "command": "learn" if start.mount.moves else "eye-to-hand",
+            "scene": built.scene.name,
+            "frames": len(frames),
+            "map": built.scene.digest,
+        },
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
+    if correction.arm is not None:
+        calibration = _with_joints(calibration, correction.arm, frames)
+    warnings = _warnings(built.adjusted)
+    advice = ""
+    if start.mount.moves:
+        advice = _advice(frames, estimate)
+    sentences = verdict_of(calibration, warnings, advice)
+    return HandEye(
+        replace(calibration, verdict=sentences),
+        start.pairs,
+        start.of_pairs,
+        start_mm,
+        start_deg,
+        given_mm,
+        given_deg,
+        warnings,
+        advice,
+    )
+
+
+def verdict_of(calibration: Calibration, warnings: Sequence[str], advice: str) -> str:
+    """Return the warnings, or else what the calibration is good for; then the advice."""
+    sentences = [f"Do not rely on it: {warning}." for warning in warnings]
+    if not sentences:
+        sentences.append(verdict(calibration))
+    if advice:
+        sentences.append(f"{advice[:1].upper()}{advice[1:]}.")
+    return " ".join(sentences)
+
+
+def _advice(frames: Sequence[Frame], gripper_from_camera: UncertainPose) -> str:
+    grippers = stated_grippers(frames)
+    open_direction = open_position(grippers, gripper_from_camera.pose)
+    if open_direction is None:
+        return ""
+    variances = np.linalg.eigvalsh(gripper_from_camera.covariance[:3, :3])
+    return open_direction.sentence(1000 * float(np.sqrt(variances[-1])))
+
+
+def _uses(frames: Sequence[Frame], built: BuiltMap) -> tuple[ImageUse, ...]:
+    """Use of each frame; residuals are those of its gripper pose."""
+    assert built.hand_eye is not None, "the map was built for a hand-eye calibration"
+    uses = []
+    for frame in frames:
+        name = frame.name
+        if isinstance(frame.image, Path):
+            name = str(frame.image)
+        residual = built.hand_eye.residuals.get(frame.name)
+        if frame.name in built.adjusted.wrong_poses:
+            reason = "its gripper pose contradicts the images"
+            uses.append(ImageUse(name, False, reason))
+        elif frame.name in built.adjusted.untracked:
+            reason = "it could not be tracked in other images"
+            uses.append(ImageUse(name, False, reason))
+        elif residual is not None:
+            uses.append(ImageUse(name, True, "", *length_mm_deg(residual)))
+    return tuple(uses)
+
+
+def _with_joints(
+    calibration: Calibration, arm: ArmOffsets, frames: Sequence[Frame]
+) -> Calibration:
+    return replace(
+        calibration,
+        joints=_joint_offsets(arm),
+        joint_covariance=arm.covariance,
+        checks=LearnedChecks(joints_move_mm=_moved_mm(arm, frames)),
+    )
+
+
+def _joint_offsets(offsets: ArmOffsets) -> tuple[JointOffset, ...]:
+    """The offsets, and why some are not determined."""
+    free = offsets.arm.free()
+    rotates = offsets.arm.rotates()
+    rows = []
+    for i, name in enumerate(offsets.arm.joints):
+        why = ""
+        sigma = offsets.prior[i]
+        if not free[i]:
+            frame = "base" if i == 0 else "gripper"
+            why = f"its offset turns the frame of the {frame}: a mark at its zero shows it"
+        elif not offsets.determined[i]:
+            why = f"move {name} and the joints after it more between the images"
+        else:
+            sigma = np.sqrt(offsets.covariance[i, i])
+        value = float(offsets.values[i])
+        rows.append(JointOffset(name, value, float(sigma), bool(rotates[i]), why))
+    return tuple(rows)
+
+
+def _moved_mm(offsets: ArmOffsets, frames: Sequence[Frame]) -> list[float]:
+    """Mean and largest displacement of the gripper by the offsets."""
+    values = np.array([f.joints_rad for f in frames if f.joints_rad is not None])
+    before = offsets.arm.poses(values)
+    after = offsets.arm.poses(values + offsets.values)
+    shift = after.translation_m - before.translation_m
+    lengths = 1000 * np.linalg.norm(shift, axis=1)
+    return [float(lengths.mean()), float(lengths.max())]
+
+
+def _warnings(adjusted: Adjusted) -> tuple[str, ...]:
+    warnings = []
+    if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
+        warnings.append(
+            f"the images suggest a focal length {adjusted.focal_percent:+.1f} % from the stated"
+            " one: calibrate the intrinsics first ('evercal detect' on images of a board)"
+        )
+    if (adjusted.pose_sigma_mm or 0) > MOST_POSE_SIGMA_MM:
+        warnings.append(
+            f"the gripper poses fit the images to {adjusted.pose_sigma_mm:.0f} mm only: let the arm"
+            " stand still at every image, and check the clocks"
+        )
+    return tuple(warnings)

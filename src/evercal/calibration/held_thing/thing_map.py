@@ -1,0 +1,69 @@
+"""The map of a thing that the gripper holds: its frames, and the scatter of its images."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from evercal.calibration.checks import LearnedChecks
+from evercal.calibration.from_map.hand_eye import HandEye
+from evercal.calibration.from_map.hand_eye_start import HandEyeStart
+from evercal.calibration.held_thing.windows import cropped, windows
+from evercal.calibration.located import deviations
+from evercal.geometry import SE3, Camera
+from evercal.mapping.scene_map import SceneMap
+from evercal.recordings.frame import Frame, Recording
+
+
+def in_windows(recording: Recording, start: HandEyeStart) -> Recording:
+    """The recording with windows around the thing instead of whole images, if it is small."""
+    around = windows(recording.train, start)
+    if around is None:
+        return recording
+    train = []
+    for frame, window in zip(recording.train, around, strict=True):
+        train.append(cropped(frame, window))
+    return replace(recording, train=tuple(train))
+
+
+def of_whole_images(scene: SceneMap, whole: Camera) -> SceneMap:
+    """The map of a thing in the gripper, with the camera of whole images instead of windows."""
+    window = scene.camera
+    adjusted = scene.adjusted_camera
+    adjusted = replace(
+        adjusted,
+        width=whole.width,
+        height=whole.height,
+        cx=whole.cx + (adjusted.cx - window.cx),
+        cy=whole.cy + (adjusted.cy - window.cy),
+    )
+    return replace(
+        scene, camera=whole, adjusted_camera=adjusted, parent_frame="gripper"
+    )
+
+
+def with_image_scatter(
+    estimate: HandEye,
+    frames: Sequence[Frame],
+    gripper_from_camera: Sequence[SE3 | None],
+) -> HandEye:
+    """The estimate with the scatter of single images, which `check` compares a shift with.
+
+    `gripper_from_camera` are the poses of n frames in the finished map, None of those that are not
+    located. Gripper poses lead to the base.
+    """
+    base_from_camera = []
+    for frame, pose in zip(frames, gripper_from_camera, strict=True):
+        if pose is not None and frame.base_from_gripper is not None:
+            base_from_camera.append(frame.base_from_gripper @ pose)
+    if len(base_from_camera) < 2:
+        return estimate
+    calibration = estimate.calibration
+    deviation = deviations(
+        SE3.stack(base_from_camera), estimate.parent_from_camera.pose
+    )
+    scatter = deviation.T @ deviation / len(deviation)
+    checks = LearnedChecks(
+        images_used=len(deviation),
+        image_scatter=scatter.tolist(),
+        joints_move_mm=calibration.checks.joints_move_mm,
+    )
+    return replace(estimate, calibration=replace(calibration, checks=checks))

@@ -1,0 +1,106 @@
+"""A scene from frames with camera poses, stated or estimated: map, scatter and report."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from evercal.errors import InputError
+from evercal.learning.located import localizer_of, located_as_stated
+from evercal.learning.report import LearnReport
+from evercal.learning.stated_scatter import with_scatter
+from evercal.mapping.build import MapOptions, build_map
+from evercal.mapping.built_map import BuiltMap
+from evercal.mapping.memory_budget import MemoryBudget
+from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.progress import OnProgress
+from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.held_out import HeldOutSplit
+from evercal.recordings.pictures import look_at
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedScene:
+    """A new scene, and how it came about."""
+
+    scene: SceneMap
+    """What is stored."""
+    built: BuiltMap
+    """The map before its scatter was fitted."""
+    split: HeldOutSplit
+    metric: bool
+    """Whether the recording was in metres."""
+
+    def report(self, contents: MapContents, began: float) -> LearnReport:
+        """The report of a scene that joins `contents`; `began` is a time of `perf_counter`."""
+        adjusted = self.built.adjusted
+        if not self.metric:
+            adjusted = replace(adjusted, common_translation_mm=None, pose_sigma_mm=None)
+        return LearnReport(
+            scene=self.scene.name,
+            seconds=time.perf_counter() - began,
+            memory_bytes=contents.with_scene(self.scene).memory_bytes,
+            frames_kept=len(self.scene.keyframes),
+            train_frames=len(self.split.train),
+            held_out_frames=len(self.split.held_out),
+            landmarks=self.scene.landmarks,
+            adjusted=adjusted,
+        )
+
+
+def require_usable(recording: Recording) -> None:
+    """Refuse a recording whose images show too little."""
+    shown = look_at(recording.train)
+    if not shown.usable:
+        raise InputError(f"scene {recording.name!r}: {'; '.join(shown.warnings)}")
+
+
+def learn_posed(
+    recording: Recording,
+    split: HeldOutSplit,
+    contents: MapContents,
+    budget: MemoryBudget,
+    options: MapOptions,
+    on_progress: OnProgress,
+) -> LearnedScene:
+    """Build the map of a scene and fit the scatter of its poses to the held-out frames."""
+    options = sized(options, budget, contents)
+    options = replace(options, metric=recording.metric)
+    encoder = contents.encoder
+    built = build_map(recording.name, split.train, encoder, options, on_progress)
+    if budget.auto:
+        from evercal.learning.fewest_keyframes import fewest_keyframes
+
+        built = built.take(fewest_keyframes(contents, built, split.train, on_progress))
+    scene = with_scatter(
+        # Alone in a map, so that it does not depend on the other scenes.
+        contents.empty().with_scene(built.scene),
+        built.corrected(split.held_out),
+        left_out=built.left_out(split.train),
+        noise=built.independent_noise,
+    )
+    built = cleared(built, scene, split.train, contents)
+    return LearnedScene(scene, built, split, recording.metric)
+
+
+def sized(
+    options: MapOptions, budget: MemoryBudget, contents: MapContents
+) -> MapOptions:
+    """The options with a number of keyframes, for images of the size that the map encodes."""
+    if budget.auto:
+        from evercal.learning.fewest_keyframes import MOST_SHARE
+
+        budget = MemoryBudget(share=MOST_SHARE)
+    size = replace(options.size, cells=contents.short_side)
+    return replace(options, memory=budget, size=size)
+
+
+def cleared(
+    built: BuiltMap, scene: SceneMap, frames: Sequence[Frame], contents: MapContents
+) -> BuiltMap:
+    """The map, without accusing frames that the scene locates where their poses say."""
+    wrong = built.adjusted.wrong_poses
+    accused = [frame for frame in frames if frame.name in wrong]
+    if not accused:
+        return built
+    localizer = localizer_of(contents, scene)
+    return built.cleared(located_as_stated(localizer, built.corrected(accused)))

@@ -1,0 +1,65 @@
+"""`LearnReport`: the outcome of learning a scene, printed and stored as JSON."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+from evercal.mapping.built_map import Adjusted
+
+if TYPE_CHECKING:
+    from evercal.calibration.from_map.hand_eye import HandEye
+
+
+@dataclass(frozen=True)
+class LearnReport:
+    """Outcome of learning a scene."""
+
+    scene: str
+    """Name of the scene."""
+    seconds: float
+    """Wall time."""
+    memory_bytes: int
+    """Size of the keyframes of all scenes."""
+    frames_kept: int
+    """Keyframes of this scene."""
+    train_frames: int
+    """Frames that were learned."""
+    held_out_frames: int
+    """Frames that the scatter of the stated poses was fitted to."""
+    landmarks: int = 0
+    """Landmarks of this scene."""
+    adjusted: Adjusted | None = None
+    """Changes by bundle adjustment; None for networks."""
+    hand_eye: "HandEye | None" = None
+    """The estimated camera on the gripper; None where the recording states camera poses."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON values, as `evercal learn --json` prints them."""
+        values = dict(vars(self))
+        values["adjusted"] = self.adjusted and asdict(self.adjusted)
+        values["hand_eye"] = self.hand_eye and self.hand_eye.to_dict()
+        # Networks have others.
+        values.setdefault("iterations", 0)
+        values.setdefault("head_bytes", 0)
+        return values
+
+    def stored(self) -> dict[str, Any]:
+        """Return `to_dict` with the calibration, as it is stored with the scene."""
+        values = self.to_dict()
+        if self.hand_eye is not None:
+            values["calibration"] = self.hand_eye.calibration.to_dict()
+        return values
+
+    @classmethod
+    def from_stored(cls, values: Mapping[str, Any]) -> Self:
+        """The inverse of `stored`."""
+        from evercal.calibration.calibration import Calibration
+        from evercal.calibration.from_map.hand_eye import HandEye
+
+        own = {name: values[name] for name in cls.__dataclass_fields__}
+        if own["adjusted"] is not None:
+            own["adjusted"] = Adjusted(**own["adjusted"])
+        if own["hand_eye"] is not None:
+            calibration = Calibration.from_dict(values["calibration"])
+            own["hand_eye"] = HandEye.from_dict(own["hand_eye"], calibration)
+        return cls(**own)
