@@ -54,15 +54,15 @@ def load(root: Path) -> Recording:
         name = root.resolve().name
     return Recording(
         name,
-        tuple(frame for split, frame in frames if split == "train"),
-        tuple(frame for split, frame in frames if split == "test"),
+        tuple(frames["train"]),
+        tuple(frames["test"]),
         data.get("untracked", 0),
         notes=tuple(data.get("notes", ())),
         metric=data.get("unit") != "unknown",
     )
 
 
-def _frames(root: Path, data: Mapping[str, Any]) -> list[tuple[Split, Frame]]:
+def _frames(root: Path, data: Mapping[str, Any]) -> dict[Split, list[Frame]]:
     entries = data.get("frames")
     notes = data.get("notes", [])
     if not isinstance(entries, list) or not entries:
@@ -74,11 +74,14 @@ def _frames(root: Path, data: Mapping[str, Any]) -> list[tuple[Split, Frame]]:
     if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
         raise ValueError(f"'notes' is a list of sentences, got {notes!r}")
     cameras = _cameras(data.get("cameras"))
-    frames = []
+    frames: dict[Split, list[Frame]] = {"train": [], "test": []}
+    names = []
     for i, entry in enumerate(entries):
         with naming(f"frame {i}"):
-            frames.append(_frame(root, entry, cameras))
-    refuse_repeated((frame.name for _, frame in frames), "names of frames are unique")
+            split, frame = _frame(root, entry, cameras)
+        frames[split].append(frame)
+        names.append(frame.name)
+    refuse_repeated(names, "names of frames are unique")
     return frames
 
 

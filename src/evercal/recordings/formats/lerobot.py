@@ -191,14 +191,15 @@ def _video_starts(
 ) -> dict[int, tuple[Path, float]]:
     """By episode: its video, and the time in the video at which it starts."""
     video = functools.partial(_video, root, str(info["video_path"]), video_key=key)
+    starts: dict[int, tuple[Path, float]] = {}
     if str(info["codebase_version"]).startswith("v2"):
         size = int(info.get("chunks_size", 1000))
-        return {
-            i: (video(episode_chunk=i // size, episode_index=i), 0.0) for i in episodes
-        }
+        for i in episodes:
+            path = video(episode_chunk=i // size, episode_index=i)
+            starts[i] = (path, 0.0)
+        return starts
     parts = ("chunk_index", "file_index", "from_timestamp")
     names = ["episode_index", *(f"videos/{key}/{part}" for part in parts)]
-    starts = {}
     for file in files_in(root / "meta" / "episodes", (".parquet",), "*/*"):
         for episode, chunk, number, start in zip(*_columns(file, names), strict=True):
             path = video(chunk_index=chunk, file_index=number)

@@ -47,14 +47,16 @@ def pose_feature(root: Path, info: Info, options: ReadOptions) -> str:
                 f"{root}: no feature {column!r}; `gripper_frame` is one of {names}"
             )
         return column
-    observed = {
-        key: _names(info, key) for key in features if key.startswith("observation")
-    }
-    keys = [key for key, names in observed.items() if _convention_of(names)]
-    if options.gripper_frame is not None:
-        keys = [
-            key for key in keys if options.gripper_frame in (key, *_arms(observed[key]))
-        ]
+    arm = options.gripper_frame
+    observed = {}
+    keys = []
+    for key in features:
+        if key.startswith("observation"):
+            names = _names(info, key)
+            observed[key] = names
+            is_chosen = arm is None or arm in (key, *_arms(names))
+            if is_chosen and _convention_of(names):
+                keys.append(key)
     if _STATE in keys:
         return _STATE
     if len(keys) == 1:
@@ -134,7 +136,7 @@ def _pose_columns(names: list[str], arm: str | None) -> tuple[str, list[int]]:
     last = _last_parts(chosen)
     if any(last.count(part) > 1 for part in parts):
         remedy = "names that tell them apart in info.json"
-        prefixes = [prefix for prefix in arms if prefix]
+        prefixes = [*filter(None, arms)]
         if prefixes:
             remedy = f"`gripper_frame` {' or '.join(prefixes)}"
         raise ValueError(f"holds several poses ({', '.join(names)}); give {remedy}")

@@ -78,7 +78,7 @@ def detect(root: Path) -> bool:
     """Whether `root` holds, or is, a transforms.json or a file of that kind."""
     if root.is_file():
         return root.name.startswith("transforms") and root.suffix == ".json"
-    return any((root / name).is_file() for name in _FILES)
+    return _file_in(root).is_file()
 
 
 def load(root: Path, options: ReadOptions) -> Recording:
@@ -132,9 +132,11 @@ def _frames(file: Path) -> tuple[list[Frame], set[str], int]:
             root = _image_root(file, str(first["file_path"]))
             # Without a stated image size, that of the first image is taken.
             if {"w", "h"}.isdisjoint([*data, *first]):
-                named = [entry for entry in entries if isinstance(entry, dict)]
-                names = [str(entry.get("file_path")) for entry in named]
-                width, height = first_size([_image(root, name) for name in names])
+                images = []
+                for entry in entries:
+                    if isinstance(entry, dict):
+                        images.append(_image(root, str(entry.get("file_path"))))
+                width, height = first_size(images)
                 data["w"] = width
                 data["h"] = height
         frames = []

@@ -72,8 +72,10 @@ class BagFile:
         with library_errors(f"{path}: rosbags cannot read it", _REMEDIES):
             self._reader = highlevel.AnyReader(parts, default_typestore=types)
             self._reader.open()
-            links = [link for link in self._reader.connections if link.msgcount]
-            kinds = {str(link.topic): str(link.msgtype) for link in links}
+            kinds = {}
+            for link in self._reader.connections:
+                if link.msgcount:
+                    kinds[str(link.topic)] = str(link.msgtype)
         weakref.finalize(self, self._reader.close)
         self._lock = threading.Lock()
         self.kinds = kinds

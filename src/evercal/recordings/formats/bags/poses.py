@@ -150,9 +150,10 @@ class _TfTree:
         topics = self._edges[child]
         if self._topic in topics:
             return topics[self._topic]
-        edges = [*topics.values()]
-        moving = [edge for edge in edges if edge.moving]
-        return (moving or edges)[0]
+        for edge in topics.values():
+            if edge.moving:
+                return edge
+        return next(iter(topics.values()))
 
     def _refuse_ambiguous(self, child: str) -> None:
         topics = self._edges[child]
@@ -196,8 +197,10 @@ def _agree(edges: Sequence[_Edge]) -> bool:
     moving = [edge for edge in edges if edge.moving]
     if moving:
         return len(moving) == 1
-    last = [edge.transforms[-1] for edge in edges]
-    numbers = [(*transform.translation, *transform.quaternion) for transform in last]
+    numbers = []
+    for edge in edges:
+        last = edge.transforms[-1]
+        numbers.append((*last.translation, *last.quaternion))
     return np.allclose(numbers[0], numbers, atol=1e-6)
 
 
