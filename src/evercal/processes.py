@@ -59,8 +59,8 @@ _limits = threading.Lock()
 def one_product_thread() -> Iterator[None]:
     """Calculate matrix products with one thread meanwhile, in the whole process.
 
-    Those of an image are so small that threads mostly wait for each other: on a busy machine an
-    image takes ten times as long with two.
+    The matrices of an image are so small that threads mostly wait for each other: on a busy machine
+    an image takes ten times as long with two.
     """
     global _pools, _limiting
     with _limits:

@@ -15,7 +15,7 @@ OnProgress = Callable[[str, int, int], object]
 _INTERVALS_S = {True: 0.2, False: 10.0}
 """Least time between two updates of a bar, on a terminal and in a file."""
 _RESUMED = 8
-"""A step whose first report says that more is done than this was resumed."""
+"""If more than this is done at the first report of a step, the step was resumed."""
 _UNITS = {
     "encoding": "image",
     "learning": "scene",

@@ -26,8 +26,11 @@ if TYPE_CHECKING:
     from evercal.reports.page import Picture
 
 STORE = "store"
+"""Folder of the map."""
 QUERY = "query.png"
+"""File of an image to localize."""
 REPORT = "report.html"
+"""File of the report."""
 UNKNOWN_IMAGES = 12
 """Images of each room that are localized before the room is learned."""
 PICTURES = 3

@@ -10,6 +10,7 @@ from evercal.cli import args
 from evercal.cli.console import length, size, table
 
 MEMORY_FILES = ("keyframes.safetensors", "state.safetensors")
+"""Files of the keyframes: of a scene of a map, and of a store of networks."""
 
 
 @dataclass(frozen=True)

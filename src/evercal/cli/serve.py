@@ -8,6 +8,7 @@ from evercal.cli import args
 from evercal.errors import InputError, missing_extra
 
 TOKEN = "EVERCAL_TOKEN"
+"""Environment variable of the bearer token."""
 
 
 @dataclass(frozen=True)

@@ -170,8 +170,8 @@ def recall_area(translation_m: ArrayLike, within_m: float = 0.2) -> float:
 def continual_scores(accuracies: ArrayLike) -> ContinualScores:
     """Final accuracy and forgetting of one run over a sequence of scenes; NaN for a single one.
 
-    Row i of `accuracies` (N, N) holds those after stage i, column j those of the scene learned in
-    stage j. Entries above the diagonal are ignored.
+    Entry (i, j) of `accuracies` (N, N) is the accuracy after stage i on the scene learned in stage
+    j. Entries above the diagonal are ignored.
     """
     matrix = np.asarray(accuracies, dtype=np.float64)
     count = len(np.atleast_1d(matrix))

@@ -26,6 +26,7 @@ POSES = "base_from_gripper.csv"
 JPEG_QUALITY = 95
 """Quality of the images, as of libjpeg."""
 _COLUMNS = "x,y,z,qw,qx,qy,qz"
+"""Columns of a pose: metres, then the quaternion."""
 
 
 class WristRecorder:
@@ -70,7 +71,7 @@ class WristRecorder:
         return frame
 
     def remove(self, name: str) -> None:
-        """Remove a sample, or raise InputError if there is none of this name."""
+        """Remove a sample by name; InputError if it does not exist."""
         left = [frame for frame in self._frames if frame.name != name]
         if len(left) == len(self._frames):
             raise InputError(f"{name}: no such sample in {self._root}")
@@ -89,7 +90,7 @@ class WristRecorder:
 
 
 def next_name(names: Iterable[str]) -> str:
-    """File name of the image after those with these names, which are numbers."""
+    """File name of the next image: one more than the largest number among the names."""
     number = 0
     for name in names:
         number = max(number, int(Path(name).stem) + 1)

@@ -50,7 +50,7 @@ class PoseFileRobot:
         self._most_age_s = most_age_s
 
     def base_from_gripper(self) -> SE3:
-        """Read the pose of the last complete line, or raise InputError if there is none."""
+        """Read the pose of the last complete line; InputError without such a line."""
         pose = read_last_robot_pose(self._path, self._convention)
         if self._most_age_s is not None:
             # First: it may be written at any time.

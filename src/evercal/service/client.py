@@ -45,9 +45,7 @@ class Client:
             import urllib3
         except ImportError:
             raise missing_extra("a client needs urllib3", "serve") from None
-        headers = {}
-        if token is not None:
-            headers["Authorization"] = f"Bearer {token}"
+        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         self._url = url.rstrip("/")
         retries = urllib3.Retry(
             connect=2, read=0, redirect=0, status=0, other=0, backoff_factor=0.1

@@ -41,9 +41,7 @@ def listening_socket(host: str, port: int) -> socket.socket:
     """A socket that listens; InputError names `host` or `port` otherwise. Port 0 is any free."""
     if not 0 <= port <= 65_535:  # the resolver takes the remainder
         raise InputError(f"`port` {port}: give 0 to 65535")
-    family = socket.AF_INET
-    if ":" in host:
-        family = socket.AF_INET6
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family)
     except OSError as error:

@@ -23,6 +23,7 @@ from evercal.recordings.poses.pairing import poses_of_images
 Image.preinit()
 Content = TypeVar("Content")
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
+"""Formats of images, as Pillow names them."""
 
 
 class TooLargeError(InputError):

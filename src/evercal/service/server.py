@@ -79,9 +79,7 @@ def make_app(
         title="evercal", version="1", docs_url=None, redoc_url=None, lifespan=lifespan
     )
     # Only for the page, which then can send the token; the guard compares it.
-    bearer = []
-    if options.token:
-        bearer.append(Security(HTTPBearer(auto_error=False)))
+    bearer = [Security(HTTPBearer(auto_error=False))] if options.token else []
     app.include_router(routes.router, dependencies=bearer)
     app.mount(PAGES, StaticFiles(packages=[("fastapi_swagger", "resources")]))
     app.get("/docs", include_in_schema=False)(_page)
@@ -131,6 +129,7 @@ def _line(
 
 
 _STATUS = {TooLargeError: 413, InputError: 400}
+"""HTTP status of an error; the first kind that fits counts."""
 
 
 def bound_socket(options: ServeOptions) -> socket.socket:

@@ -141,8 +141,7 @@ class Controls:
         studio = self._studio
         gui = self._gui
         tasks = self._tasks
-        keys = {"wrist": ("T", "M"), "fixed": (None, None)}
-        take, move = keys[which]
+        take, move = ("T", "M") if which == "wrist" else (None, None)
         self._button("Take sample", lambda: studio.take_sample(which), take)
         if studio.can_move:
             self._button("Move there", lambda: studio.move_on(which), move)

@@ -26,12 +26,12 @@ class Devices:
     wrist_camera: LiveCamera | None
     """The camera on the gripper; None where only a fixed camera is calibrated."""
     intrinsics: Camera
-    """Its intrinsics, at the size of its images; those of the fixed camera if it is None."""
+    """Its intrinsics, at the size of its images; without it, those of the fixed camera."""
     robot: Robot
     """It moves on request if it is a `MovingRobot`."""
     fixed_camera: LiveCamera | None = None
     fixed_intrinsics: Camera | None = None
-    """Those of the fixed camera; None for those of the camera on the gripper."""
+    """Intrinsics of the fixed camera; None if both cameras have the same."""
     reachable: SE3 | None = None
     """(n,) gripper poses that the arm can reach; None if unknown."""
     holding: SE3 | None = None

@@ -162,9 +162,7 @@ class _Drawing:
                     frame.read_image(),
                 )
             drawn = self._samples[name]
-            drawn.color = GREEN
-            if name in bad:
-                drawn.color = RED
+            drawn.color = RED if name in bad else GREEN
             place(drawn, gripper @ self._mount())
         place(self._next, next_view and next_view.poses[0] @ self._mount())
 

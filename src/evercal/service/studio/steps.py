@@ -12,6 +12,7 @@ State = tuple[Literal["waits", "to do", "done"], str]
 """Status of a step, and its result or what to do in one to three sentences."""
 
 _NO_FIXED = "No fixed camera was given; restart with `fixed` SOURCE, or go on."
+"""What to do in a step that needs a fixed camera."""
 
 
 def _connect(studio: Studio) -> State:

@@ -85,8 +85,7 @@ class Studio:
 
     def recording(self, which: Which) -> Path:
         """Samples of the camera on the gripper, or of a fixed camera that sees a held thing."""
-        names = {"wrist": "wrist", "fixed": "held"}
-        return self.out / names[which]
+        return self.out / ("wrist" if which == "wrist" else "held")
 
     @property
     def can_move(self) -> bool:
@@ -109,9 +108,7 @@ class Studio:
 
     def _table_sha256(self, which: Which) -> str | None:
         table = self.recording(which) / POSES
-        if not table.is_file():
-            return None
-        return sha256_file(table)
+        return sha256_file(table) if table.is_file() else None
 
     @property
     def fixed_images(self) -> list[Path]:
@@ -308,9 +305,7 @@ class Studio:
         folder = self.out / "export"
         folder.mkdir(exist_ok=True)
         # Formats share endings; easy_handeye2 looks files up by their name.
-        name = str(which)
-        if format != "easy_handeye2":
-            name += f"_{format}"
+        name = which if format == "easy_handeye2" else f"{which}_{format}"
         poses = None
         if which == "wrist" and chosen.per_image:
             poses = self.out / "wrist" / POSES
@@ -330,9 +325,7 @@ class Studio:
         return self.calibrations[which]
 
     def _fixed_intrinsics(self) -> Camera | None:
-        if not self._fixed_camera.is_file():
-            return None
-        return read_camera(self._fixed_camera)
+        return read_camera(self._fixed_camera) if self._fixed_camera.is_file() else None
 
     def _write(self, which: Which, calibration: Calibration, **source: object) -> None:
         calibration = replace(calibration, source={**calibration.source, **source})

@@ -23,7 +23,7 @@ _COLOURS = {
     "lost": RED,
     "ended": RED,
 }
-"""Of states; those of all others are green."""
+"""Colours of states; all other states are green."""
 _TEXT = "padding:2px 12px 6px;font-size:0.85em;line-height:1.4;overflow-wrap:anywhere"
 
 

@@ -33,6 +33,7 @@ from evercal.service.viewer.html import (
 )
 
 _THROUGH = "/through"
+"""Node of the image behind the landmarks of a keyframe."""
 
 
 class Page:
@@ -75,14 +76,12 @@ class Page:
         """Show a camera, a video or a folder as it is tracked; by default with the map's camera."""
         camera = StreamCamera(source)
         height, width = camera.read()[1].shape[:2]
-        stated = None
-        if intrinsics is not None:
-            stated = read_camera(intrinsics, (width, height))
+        size = (width, height)
+        stated = None if intrinsics is None else read_camera(intrinsics, size)
         tracker = Tracker(self._localizer, stated)
-        thread = threading.Thread(
+        threading.Thread(
             target=self._track, args=(camera, tracker), daemon=True
-        )
-        thread.start()
+        ).start()
 
     def look_through(self, view: KeyframeView, client: viser.ClientHandle) -> None:
         """Show a visitor what a keyframe shows: its image stands behind its landmarks."""
@@ -206,7 +205,7 @@ class _Server(viser.ViserServer):
     """A silent server that is not shared over viser's public relay, whatever a visitor asks."""
 
     key = ""
-    """First part of the path; who does not know it is refused."""
+    """First part of the path; requests without it are refused."""
 
     @property
     def url(self) -> str:
@@ -222,7 +221,7 @@ class _Server(viser.ViserServer):
 
 
 def start_server(host: str, port: int, label: str) -> _Server:
-    """An empty page with z up, for those who know its address."""
+    """An empty page with z up; its address holds a random key."""
     listening_socket(host, port).close()  # viser alone would take the next free port
     key = secrets.token_urlsafe(16)
     # Viser prints.
