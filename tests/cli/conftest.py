@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
 import re
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import pytest
 
 from evercal.cli import main
-
-if TYPE_CHECKING:
-    from evercal.mapping.scene_map import MapContents
-    from evercal.recordings import Recording
 
 
 @dataclass(frozen=True)
@@ -26,16 +25,30 @@ class Ran:
     err: list[str]
     """Lines on stderr apart from progress bars."""
 
+    @property
+    def json(self) -> Any:
+        """The object on stdout."""
+        return json.loads(self.out)
 
-Run = Callable[..., Ran]
+
+def words_of(words: Iterable[object]) -> list[str]:
+    """Words of a command; a string stands for all words in it, other things for one."""
+    split = []
+    for word in words:
+        split += word.split() if isinstance(word, str) else [str(word)]
+    return split
 
 
-@pytest.fixture
-def run(capfd: pytest.CaptureFixture[str]) -> Run:
-    def call(*words: object) -> Ran:
-        capfd.readouterr()
-        code = main([str(word) for word in words])
-        out, err = capfd.readouterr()
+@dataclass(frozen=True)
+class Run:
+    """Runs commands in this process; a string may hold several words."""
+
+    capture: pytest.CaptureFixture[str]
+
+    def __call__(self, *words: object) -> Ran:
+        self.capture.readouterr()
+        code = main(words_of(words))
+        out, err = self.capture.readouterr()
         # A bar rewrites its line after a carriage return and ends it with a line break.
         lines = [
             line
@@ -44,11 +57,24 @@ def run(capfd: pytest.CaptureFixture[str]) -> Run:
         ]
         return Ran(code, out, lines)
 
-    return call
+    def json(self, *words: object) -> Any:
+        """The object that a command prints with --json."""
+        return self(*words, "--json").json
+
+    def refused(self, *words: object) -> str:
+        """The one line of a command that refuses its input and prints nothing else."""
+        ran = self(*words)
+        assert (ran.code, ran.out, len(ran.err)) == (2, "", 1), ran
+        return ran.err[0]
+
+
+@pytest.fixture
+def run(capfd) -> Run:
+    return Run(capfd)
 
 
 @pytest.fixture(scope="session")
-def rooms(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def rooms(tmp_path_factory) -> tuple[Path, Path]:
     """Folders of the scenes `box-room-41` and `box-room-42`, 24 training and 6 test frames each."""
     from evercal.recordings import generic
 
@@ -61,15 +87,22 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 @pytest.fixture(scope="session")
-def store(tmp_path_factory: pytest.TempPathFactory, rooms: tuple[Path, Path]) -> Path:
-    """A map of `box-room-41` from `evercal learn`; tests do not change it."""
+def learned(tmp_path_factory, rooms) -> tuple[Path, str]:
+    """A map of `box-room-41` that tests do not change, and what `evercal learn` printed."""
     folder = tmp_path_factory.mktemp("stores") / "cell.evercal"
-    assert main(["learn", str(folder), str(rooms[0])]) == 0
-    return folder
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        assert main(words_of(["learn", folder, rooms[0]])) == 0
+    return folder, printed.getvalue()
 
 
 @pytest.fixture(scope="session")
-def hall_store(hall_map: MapContents, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def store(learned) -> Path:
+    """A map of `box-room-41`; tests do not change it."""
+    return learned[0]
+
+
+@pytest.fixture(scope="session")
+def hall_store(hall_map, tmp_path_factory) -> Path:
     """A map of `hall`; tests do not change it."""
     from evercal.mapping.store import MapStore
 
@@ -79,7 +112,7 @@ def hall_store(hall_map: MapContents, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.fixture(scope="session")
-def still_images(hall: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def still_images(hall, tmp_path_factory) -> Path:
     """A folder of 20 noisy images of a camera that stands still, at the pose of hall.test[3]."""
     import numpy as np
 
@@ -95,7 +128,7 @@ def still_images(hall: Recording, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 @pytest.fixture(scope="session")
-def four_images(still_images: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def four_images(still_images, tmp_path_factory) -> Path:
     """The first four of `still_images`."""
     folder = tmp_path_factory.mktemp("four")
     for path in sorted(still_images.iterdir())[:4]:
@@ -104,23 +137,13 @@ def four_images(still_images: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.fixture(scope="session")
-def network_store(
-    tmp_path_factory: pytest.TempPathFactory, rooms: tuple[Path, Path]
-) -> Path:
+def network_store(tmp_path_factory, rooms) -> Path:
     """A store of a network with 5 centres that was trained for four steps on `box-room-41`."""
     from evercal.continual.learning.presets import PRESETS
 
     demo = PRESETS["demo"]
     folder = tmp_path_factory.mktemp("stores") / "network.evercal"
-    words = [
-        "learn",
-        str(folder),
-        str(rooms[0]),
-        "--strategy",
-        "finetune",
-        "--centres",
-        "5",
-    ]
+    options = "--strategy finetune --centres 5 --preset demo --seed 1"
     with pytest.MonkeyPatch.context() as patch:
         small = replace(
             demo,
@@ -129,5 +152,5 @@ def network_store(
             encode=replace(demo.encode, views_per_frame=1),
         )
         patch.setitem(PRESETS, "demo", small)
-        assert main([*words, "--preset", "demo", "--seed", "1"]) == 0
+        assert main(words_of(["learn", folder, rooms[0], options])) == 0
     return folder

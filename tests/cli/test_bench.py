@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -14,13 +12,9 @@ from evercal.continual.benchmark.results import STRATEGIES, read, read_frames
 from evercal.continual.learning.presets import short_side
 from evercal.recordings import generic
 
-if TYPE_CHECKING:
-    from evercal.continual.learning.stage import StageOptions
-    from evercal.recordings import Recording
-
 
 @pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch, quick: StageOptions) -> None:
+def small(monkeypatch, quick) -> None:
     """Tiny stages."""
     monkeypatch.setattr(
         verb.Bench, "_stage", lambda self, seed: replace(quick, seed=seed)
@@ -28,16 +22,14 @@ def small(monkeypatch: pytest.MonkeyPatch, quick: StageOptions) -> None:
 
 
 @pytest.mark.slow("src/evercal/continual", "src/evercal/cli/bench.py")
-def test_bench_and_its_tables(
-    run: Any, small: None, arcs: tuple[Recording, Recording], tmp_path: Path
-) -> None:
+def test_bench_and_its_tables(run, small, arcs, tmp_path):
     folders = []
     for scene in arcs:
         folders.append(tmp_path / scene.name)
         generic.write(
             folders[-1], replace(scene, train=scene.train[:18], test=scene.test[:4])
         )
-    words = ["custom", *folders, "--strategies", "evercal,finetune", "--seeds", "0"]
+    words = ["custom", *folders, "--strategies evercal,finetune --seeds 0"]
     first = run("bench", *words, "--out", tmp_path / "out")
     assert first.code == 0, first.err
     assert "[4/4] finetune seed 0: one " in first.out
@@ -50,10 +42,10 @@ def test_bench_and_its_tables(
     assert "BWT (backward transfer): mean change" in first.out
     again = run("bench", *words, "--out", tmp_path / "out", "--json")
     assert again.code == 0
-    (summary,) = json.loads(again.out)["strategies"]["evercal"]
+    (summary,) = again.json["strategies"]["evercal"]
     assert summary["scenes"] == ["one", "two"]
     assert summary["accuracy_5cm_5deg"][0][1] is None
-    printed = run("bench", tmp_path / "out", "--strategies", "finetune")
+    printed = run("bench", tmp_path / "out", "--strategies finetune")
     assert printed.code == 0
     assert "finetune - evercal" in printed.out
     assert "finetune - evercal" in (tmp_path / "out" / "tables.md").read_text()
@@ -63,9 +55,7 @@ def test_bench_and_its_tables(
     assert "<svg" in (tmp_path / "out" / "figure.svg").read_text()
 
 
-def test_held_out_frames_are_training_frames(
-    run: Any, small: None, arcs: tuple[Recording, Recording], tmp_path: Path
-) -> None:
+def test_held_out_frames_are_training_frames(run, small, arcs, tmp_path):
     folders = []
     for scene in arcs:
         folders.append(tmp_path / scene.name)
@@ -82,10 +72,7 @@ def test_held_out_frames_are_training_frames(
     words = [
         "custom",
         *folders,
-        "--strategies",
-        "er_3,er_3",
-        "--seeds",
-        "0",
+        "--strategies er_3,er_3 --seeds 0",
         "--held-out",
     ]
     ran = run("bench", *words, "--plugin", plugin, "--out", tmp_path / "out")
@@ -105,7 +92,7 @@ def test_held_out_frames_are_training_frames(
     assert "now it is 'test frames'" in " ".join(refused.err)
 
 
-def test_table4_stands_for_its_strategies() -> None:
+def test_table4_stands_for_its_strategies():
     def names(strategies: str) -> list[str]:
         return [
             one.name
@@ -117,7 +104,7 @@ def test_table4_stands_for_its_strategies() -> None:
     assert names("joint,table4,er") == ["joint", *ablation]
 
 
-def test_options_of_the_backbone_of_the_paper() -> None:
+def test_options_of_the_backbone_of_the_paper():
     ours, paper = (
         verb.Bench("sim-mini", backbone=b, steps=7) for b in ("evercal", "paper")
     )
@@ -139,9 +126,7 @@ def test_options_of_the_backbone_of_the_paper() -> None:
     assert (shared.head.offsets, shared.head.centres) == ("shared", "fixed")
 
 
-def test_the_papers_working_images_are_not_larger_than_the_recorded(
-    hall: Recording,
-) -> None:
+def test_the_papers_working_images_are_not_larger_than_the_recorded(hall):
     def sides(factor: float) -> tuple[int, int]:
         frames = [
             replace(

@@ -1,8 +1,6 @@
 """`check` of a simulated arm: a joint that slipped by half a degree is named."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -89,9 +87,7 @@ class Cell:
         return folder
 
 
-def test_a_joint_that_slipped_is_named_and_others_are_not(
-    run: Any, tmp_path: Path
-) -> None:
+def test_a_joint_that_slipped_is_named_and_others_are_not(run, tmp_path):
     cell = Cell(tmp_path / "arm")
     store = tmp_path / "cell"
     reference = tmp_path / "wrist.json"
@@ -109,7 +105,7 @@ def test_a_joint_that_slipped_is_named_and_others_are_not(
     slipped = cell.record(tmp_path / "slipped")
     found = run("check", store, slipped, "--reference", reference, "--json")
     assert found.code == 1
-    record = json.loads(found.out)
+    record = found.json
     assert record["changed"] == ["j4"]
     assert record["confidence"] > 0.99
     assert record["camera"]["moved"] is False

@@ -1,9 +1,7 @@
 """`evercal convert`, and the reading options that it shares with `inspect` and `learn`."""
 
 import dataclasses
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +18,7 @@ from evercal.recordings import (
 
 
 @pytest.fixture
-def wave(tmp_path: Path) -> Path:
+def wave(tmp_path) -> Path:
     """A wrist recording of four images; the camera file is in the folder above."""
     root = tmp_path / "wave"
     root.mkdir()
@@ -34,9 +32,7 @@ def wave(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("options", [[], ["--hard-link"]])
-def test_recording_is_converted_to_a_scene_folder(
-    run: Any, wave: Path, tmp_path: Path, options: list[str]
-) -> None:
+def test_recording_is_converted_to_a_scene_folder(run, wave, tmp_path, options):
     out = tmp_path / "out"
     words = [
         "convert",
@@ -44,13 +40,12 @@ def test_recording_is_converted_to_a_scene_folder(
         out,
         "--camera",
         tmp_path / "camera.txt",
-        "--name",
-        "cell",
+        "--name cell",
         *options,
     ]
     ran = run(*words, "--json")
     assert (ran.code, ran.err) == (0, [])
-    record = json.loads(ran.out)
+    record = ran.json
     counts = [record[key] for key in ("train", "test", "untracked")]
     assert (record["name"], counts) == ("cell", [4, 0, 0])
     assert (record["with_base_from_camera"], record["with_base_from_gripper"]) == (0, 4)
@@ -66,12 +61,10 @@ def test_recording_is_converted_to_a_scene_folder(
         assert int(frame.read_image().mean()) == 10 * i
         assert isinstance(frame.image, Path)
         assert frame.image.samefile(wave / f"{i}.png") == bool(options)
-    ran = run(*words)
-    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-    assert "already there" in ran.err[0]
+    assert "already there" in run.refused(*words)
 
 
-def test_next_command_repeats_the_reading_options(run: Any, wave: Path) -> None:
+def test_next_command_repeats_the_reading_options(run, wave):
     camera = wave.parent / "camera.txt"
     ran = run("inspect", wave, "--every", 2, "--camera", camera)
     assert "2 training and 0 test frames with the gripper's pose" in ran.out
@@ -81,13 +74,13 @@ def test_next_command_repeats_the_reading_options(run: Any, wave: Path) -> None:
     assert last == f"next: evercal learn MAP {wave} --camera {camera} --every 2"
 
 
-def test_options_are_those_of_load_recording(run: Any) -> None:
+def test_options_are_those_of_load_recording(run):
     names = {field.name: field.default for field in dataclasses.fields(Reading)}
     assert names.pop("format") is None
     assert names == {
         field.name: field.default for field in dataclasses.fields(ReadOptions)
     }
-    text = run("inspect", "--help").out.replace("│", "")
+    text = run("inspect --help").out.replace("│", "")
     page = " ".join(text.split())
     for name in FORMATS:
         assert f" {name}" in page[page.index("Format of the recording") :]
@@ -98,7 +91,7 @@ def test_options_are_those_of_load_recording(run: Any) -> None:
 
 
 @pytest.mark.parametrize("verb", ["convert", "inspect", "learn"])
-def test_bad_input_is_one_line(run: Any, wave: Path, tmp_path: Path, verb: str) -> None:
+def test_bad_input_is_one_line(run, wave, tmp_path, verb):
     camera = tmp_path / "camera.txt"
     (tmp_path / "file").write_text("x")
     room = tmp_path / "room"
@@ -125,12 +118,8 @@ def test_bad_input_is_one_line(run: Any, wave: Path, tmp_path: Path, verb: str) 
         (tmp_path / "file", [], "a file, not a folder"),
         (tmp_path / "no", [], "no such folder"),
     ):
-        ran = run(verb, *before, scene, *after, *words)
-        assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-        assert message in ran.err[0]
+        assert message in run.refused(verb, *before, scene, *after, *words)
         assert not (tmp_path / "new").exists()
         assert not (tmp_path / "store").exists()
     if verb == "convert":
-        ran = run(verb, room, tmp_path / "file")
-        assert (ran.code, len(ran.err)) == (2, 1)
-        assert "is a file; give a folder" in ran.err[0]
+        assert "is a file; give a folder" in run.refused(verb, room, tmp_path / "file")

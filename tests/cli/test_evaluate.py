@@ -1,50 +1,38 @@
 """`evercal evaluate`: the JSON object, the table and the names of scenes."""
 
-import json
 import shutil
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from evercal.cli.evaluate import load_named
 from evercal.errors import InputError
 
+KEYS = "frames accuracy_5cm_5deg accuracy_2cm_2deg accuracy_1cm_1deg accuracy_5mm_05deg"
+KEYS += (
+    " median_translation_cm median_rotation_deg wrong_scene unknown near_training_frame"
+)
+KEYS += " inside_95"
 
-def test_json_has_the_documented_keys(run: Any, store: Path, rooms: Any) -> None:
+
+def test_json_has_the_documented_keys(run, store, rooms):
     ran = run("evaluate", store, f"box-room-41={rooms[0]}", "--json")
-    scores = json.loads(ran.out)
-    assert ran.code == 0
-    assert ran.err == []
+    scores = ran.json
+    assert (ran.code, ran.err) == (0, [])
     means = {"mean_accuracy_5cm_5deg", "mean_accuracy_1cm_1deg"}
     assert scores.keys() == {"scenes", *means, "ms_per_image"}
-    assert scores["scenes"].keys() == {"box-room-41"}
-    assert scores["scenes"]["box-room-41"].keys() == {
-        "frames",
-        "accuracy_5cm_5deg",
-        "accuracy_2cm_2deg",
-        "accuracy_1cm_1deg",
-        "accuracy_5mm_05deg",
-        "median_translation_cm",
-        "median_rotation_deg",
-        "wrong_scene",
-        "unknown",
-        "near_training_frame",
-        "inside_95",
-    }
-    assert scores["scenes"]["box-room-41"]["frames"] == 6
+    ((name, row),) = scores["scenes"].items()
+    assert row.keys() == set(KEYS.split())
+    assert (name, row["frames"]) == ("box-room-41", 6)
     text = run("evaluate", store, rooms[0]).out
     assert "box-room-41" in text
     assert text.splitlines()[-1].startswith("next: evercal ")
 
 
-def test_scenes_are_named_by_folder_or_option(rooms: Any, tmp_path: Path) -> None:
+def test_scenes_are_named_by_folder_or_option(rooms, tmp_path):
     odd = tmp_path / "a=b"
     shutil.copytree(rooms[0], odd)
-    assert list(load_named((str(rooms[0]), f"other={rooms[0]}"))) == [
-        "box-room-41",
-        "other",
-    ]
+    both = load_named((str(rooms[0]), f"other={rooms[0]}"))
+    assert list(both) == ["box-room-41", "other"]
     assert list(load_named((str(odd),))) == ["box-room-41"]
     assert list(load_named((f"x={odd}",))) == ["x"]
     with pytest.raises(InputError, match="was given twice"):

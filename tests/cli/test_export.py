@@ -1,6 +1,5 @@
 """`evercal export`: formats, frame names, driver frames and error messages."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ POSE = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
 
 
 @pytest.fixture
-def make(tmp_path: Path) -> Any:
+def make(tmp_path) -> Any:
     def write(mount: MountName = "eye_to_hand", child: str = "camera") -> Path:
         parent = "base" if mount == "eye_to_hand" else "gripper"
         camera = Camera(640, 480, 600, 601, 320, 240)
@@ -44,26 +43,22 @@ def make(tmp_path: Path) -> Any:
 
 
 @pytest.fixture
-def gripper(tmp_path: Path) -> Path:
+def gripper(tmp_path) -> Path:
     lines = [f"{i}.png,{0.5 + i / 10},0.1,0.2,1,0,0,0" for i in range(3)]
     file = tmp_path / "gripper.csv"
     file.write_text("\n".join(["image,x,y,z,qw,qx,qy,qz", *lines]))
     return file
 
 
-def test_the_list_names_every_format(run: Any) -> None:
-    lines = run("export", "--format", "list").out.splitlines()
+def test_the_list_names_every_format(run):
+    lines = run("export --format list").out.splitlines()
     assert [line.split()[0] for line in lines] == [*FORMATS, "next:"]
-    listed = json.loads(run("export", "--format", "list", "--json").out)["formats"]
-    assert listed == {
-        name: with_options(row.description) for name, row in FORMATS.items()
-    }
+    listed = run.json("export --format list")["formats"]
+    assert listed == {k: with_options(row.description) for k, row in FORMATS.items()}
 
 
 @pytest.mark.parametrize("name", ["easy_handeye2", "urdf", "opencv", "kuka"])
-def test_printed_and_written_text_are_equal(
-    run: Any, make: Any, tmp_path: Path, name: str
-) -> None:
+def test_printed_and_written_text_are_equal(run, make, tmp_path, name):
     file = make()
     printed = run("export", file, "--format", name)
     assert (printed.code, printed.err) == (0, [])
@@ -76,45 +71,32 @@ def test_printed_and_written_text_are_equal(
     assert meaning.strip() == "pose of camera in base: takes points from camera to base"
     assert verdict.strip() == "good"
     assert following.startswith("next: evercal check MAP IMAGE --reference")
-    record = json.loads(run("export", file, "--format", name, "--json").out)
+    record = run.json("export", file, "--format", name)
     assert record["text"] == printed.out
     assert record["translation_m"] == POSE.translation_m.tolist()
 
 
-def test_binary_files_and_folders_are_not_printed(
-    run: Any, make: Any, tmp_path: Path
-) -> None:
+def test_binary_files_and_folders_are_not_printed(run, make, tmp_path):
     file = make()
     for name in ("npy", "colmap"):
         refused = run("export", file, "--format", name)
         assert (refused.code, refused.out) == (2, "")
         assert "cannot be printed; give --out" in refused.err[0]
-    assert run("export", file, "--format", "npy", "--out", tmp_path / "m.npy").code == 0
+    assert run("export", file, "--format npy --out", tmp_path / "m.npy").code == 0
     np.testing.assert_allclose(np.load(tmp_path / "m.npy"), POSE.matrix())
-    written = run(
-        "export", file, "--format", "colmap", "--out", tmp_path / "m", "--json"
-    )
-    names = {Path(path).name for path in json.loads(written.out)["files"]}
+    written = run("export", file, "--format colmap --out", tmp_path / "m", "--json")
+    names = {Path(path).name for path in written.json["files"]}
     assert names == {path.name for path in (tmp_path / "m").iterdir()}
     assert names == {"cameras.txt", "images.txt", "points3D.txt"}
     assert "already there" in run(
-        "export", file, "--format", "colmap", "--out", tmp_path / "m"
+        "export", file, "--format colmap --out", tmp_path / "m"
     ).err[0]  # fmt: skip
 
 
-def test_frames_are_renamed_and_the_file_gives_the_name(
-    run: Any, make: Any, tmp_path: Path
-) -> None:
-    words = (
-        "--format",
-        "easy_handeye2",
-        "--parent",
-        "panda_link0",
-        "--child",
-        "cam_link",
-    )
+def test_frames_are_renamed_and_the_file_gives_the_name(run, make, tmp_path):
+    words = ("--format easy_handeye2 --parent panda_link0 --child cam_link",)
     out = tmp_path / "cell_left.calib"
-    run("export", make(), *words, "--robot-frame", "panda_hand", "--out", out)
+    run("export", make(), *words, "--robot-frame panda_hand --out", out)
     parameters = yaml.safe_load(out.read_text())["parameters"]
     assert parameters["name"] == "cell_left"
     frames = ("robot_base_frame", "robot_effector_frame", "tracking_base_frame")
@@ -125,10 +107,10 @@ def test_frames_are_renamed_and_the_file_gives_the_name(
     ]
 
 
-def test_the_driver_root_frame_is_exported(run: Any, make: Any, tmp_path: Path) -> None:
+def test_the_driver_root_frame_is_exported(run, make, tmp_path):
     file = make(child="camera_color_optical_frame")
     tf = tmp_path / "tf.yaml"
-    words = ("export", file, "--format", "transform_stamped")
+    words = ("export", file, "--format transform_stamped")
     note = "note: most camera drivers publish camera_color_optical_frame themselves"
     assert note in run(*words).err[0]
     for options, link_from_optical in (
@@ -138,22 +120,18 @@ def test_the_driver_root_frame_is_exported(run: Any, make: Any, tmp_path: Path) 
     ):
         link = replace(read_calibration(file), parent_from_child=link_from_optical)
         link.export("transform_stamped", tf, parent="camera_link")
-        ran = run(*words, "--via", "camera_link", *options)
+        ran = run(*words, "--via camera_link", *options)
         assert (ran.code, ran.err) == (0, [])
         (tmp_path / "out.yaml").write_text(ran.out)
         link = read_link_from_optical(tmp_path / "out.yaml", "base", "camera_link")
         assert np.max(pose_distance(link @ link_from_optical, POSE)) < 1e-9
 
 
-def test_a_camera_on_the_arm_gets_a_pose_per_robot_pose(
-    run: Any, make: Any, gripper: Path, tmp_path: Path
-) -> None:
+def test_a_camera_on_the_arm_gets_a_pose_per_robot_pose(run, make, gripper, tmp_path):
     words = (
         "export",
         make("eye_in_hand"),
-        "--format",
-        "tum",
-        "--out",
+        "--format tum --out",
         tmp_path / "c.tum",
     )
     assert run(*words, "--robot-poses", gripper).code == 0
@@ -161,18 +139,16 @@ def test_a_camera_on_the_arm_gets_a_pose_per_robot_pose(
     expected = read_robot_poses(gripper).poses @ POSE
     assert np.max(pose_distance(camera, expected)) < 1e-12
     gripper.write_text("0.png 500 100 200 0 0 0 1\n1.png 600 100 200 0 0 0 1")
-    assert run(*words, "--robot-poses", gripper, "--convention", "xyzw:mm").code == 0
+    assert run(*words, "--robot-poses", gripper, "--convention xyzw:mm").code == 0
     assert len(read_robot_poses(tmp_path / "c.tum")) == 2
-    refused = run(*words, "--robot-poses", gripper, "--convention", "xyzw")
+    refused = run(*words, "--robot-poses", gripper, "--convention xyzw")
     assert "look like millimetres; give --convention xyzw:mm" in refused.err[0]
 
 
-def test_the_arm_is_exported_with_the_offsets_of_its_joints(
-    run: Any, make: Any, tmp_path: Path
-) -> None:
+def test_the_arm_is_exported_with_the_offsets_of_its_joints(run, make, tmp_path):
     file = make("eye_in_hand")
     refused = run(
-        "export", file, "--format", "corrected_urdf", "--urdf", tmp_path / "arm.urdf"
+        "export", file, "--format corrected_urdf --urdf", tmp_path / "arm.urdf"
     )
     assert "record joints.csv and a URDF, not gripper poses" in refused.err[0]
     joints = (JointOffset("lift", 0.02, 0.001),)
@@ -189,8 +165,7 @@ def test_the_arm_is_exported_with_the_offsets_of_its_joints(
     of_lerobot = (
         "--lerobot-calibration",
         tmp_path / "so101.json",
-        "--lerobot-motors",
-        "feetech",
+        "--lerobot-motors feetech",
     )
     for name, words, expected in (
         ("joint-offsets", (), '"offset_rad": 0.02,'),

@@ -1,10 +1,8 @@
 """Offsets of joints in the output of `learn` and `eye-to-hand`."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from evercal.calibration.calibration import Calibration, JointOffset
 from evercal.cli.calibrate import joint_lines
@@ -18,7 +16,7 @@ SMALL = JointOffset("elbow", np.deg2rad(-0.1), np.deg2rad(0.06))
 RAIL = JointOffset("rail", 0.0001, 0.0002, is_angle=False)
 
 
-def test_significant_offsets_and_their_use_are_named() -> None:
+def test_significant_offsets_and_their_use_are_named():
     lines = [*joint_lines((PAN, LIFT, SMALL), "wrist.json")]
     assert lines[0] == "joint lift: add +1.25 deg (standard deviation 0.20)"
     words = "evercal export wrist.json --format corrected_urdf --urdf ROBOT.urdf --out NEW.urdf"
@@ -28,7 +26,7 @@ def test_significant_offsets_and_their_use_are_named() -> None:
     ]
 
 
-def test_insignificant_offsets_have_a_bound() -> None:
+def test_insignificant_offsets_have_a_bound():
     bound = "joints: no offset above 0.22 deg (elbow)"
     lines = [*joint_lines((SMALL, PAN), "wrist.json")]
     assert lines == [
@@ -39,9 +37,7 @@ def test_insignificant_offsets_have_a_bound() -> None:
     assert [*joint_lines((), "wrist.json")] == []
 
 
-def test_eye_to_hand_prints_them(
-    run: Any, rooms: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_eye_to_hand_prints_them(run, rooms, tmp_path, monkeypatch):
     def made(cell: Map, recording: Recording, **_: Any) -> Calibration:
         small = 1e-8 * np.eye(6)
         joints = (LIFT,)

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pytest
 
 
 def test_a_network_learns_a_second_scene(
-    run: Any,
-    network_store: Path,
-    rooms: tuple[Path, Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    run,
+    network_store,
+    rooms,
+    tmp_path,
+    monkeypatch,
+):
     """With four steps, and negative images that need no rendering. A store keeps its strategy."""
     from evercal.continual import threshold
     from evercal.continual.learning.presets import PRESETS
@@ -32,13 +29,13 @@ def test_a_network_learns_a_second_scene(
     monkeypatch.setitem(PRESETS, "demo", small)
     monkeypatch.setattr(threshold, "_negative_views", lambda *_: noise)
     store = Path(shutil.copytree(network_store, tmp_path / "store"))
-    ran = run("learn", store, rooms[1], "--preset", "demo")
+    ran = run("learn", store, rooms[1], "--preset demo")
     assert ran.code == 0, ran.err
     first, second, *_, last = ran.out.splitlines()
     assert first.startswith("box-room-42: 24 training frames")
     assert second.startswith("learned box-room-42: 20 images, 0 keyframes, 4 steps")
     assert last.startswith("next: evercal evaluate ")
-    info = json.loads(run("info", store, "--json").out)
+    info = run.json("info", store)
     assert (info["strategy"], info["short_side"]) == ("finetune", 240)
     assert [scene["name"] for scene in info["scenes"]] == ["box-room-41", "box-room-42"]
     assert all(0 <= scene["inlier_threshold"] <= 1 for scene in info["scenes"])

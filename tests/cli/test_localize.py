@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -16,32 +15,13 @@ import pytest
 from evercal.geometry import SE3, UncertainPose, pose_distance
 from evercal.recordings import read_image, write_image
 
-if TYPE_CHECKING:
-    from evercal.recordings import Recording
-
-KEYS = {
-    "path",
-    "status",
-    "reason",
-    "scene",
-    "base_from_camera",
-    "covariance",
-    "inliers",
-}
-KEYS |= {
-    "inlier_ratio",
-    "support",
-    "ms",
-    "error_terms",
-    "unit",
-    "alternatives",
-    "parent_frame",
-}
+KEYS = "path status reason scene base_from_camera covariance inliers inlier_ratio support ms"
+KEYS += " error_terms unit alternatives parent_frame"
 CAUSES = ["view", "lens", "map", "stated poses", "base frame"]
 
 
 @pytest.fixture
-def images(hall: Recording, tmp_path: Path) -> Path:
+def images(hall, tmp_path) -> Path:
     """A folder of an image of the hall and a black one."""
     folder = tmp_path / "images"
     folder.mkdir()
@@ -50,53 +30,41 @@ def images(hall: Recording, tmp_path: Path) -> Path:
     return folder
 
 
-def test_json_of_a_folder(
-    run: Any, hall_store: Path, images: Path, hall: Recording
-) -> None:
+def test_json_of_a_folder(run, hall_store, images, hall):
     ran = run("localize", hall_store, images, "--json")
     assert ran.code == 0  # one image has a pose
-    record = json.loads(ran.out)
-    assert record.keys() == {"images"}
-    located, unknown = record["images"]
-    assert located.keys() == unknown.keys() == KEYS
-    assert [Path(image["path"]) for image in (located, unknown)] == sorted(
-        images.iterdir()
-    )
-    assert (located["status"], located["reason"], located["scene"]) == (
-        "ok",
-        "",
-        "hall",
-    )
+    assert ran.json.keys() == {"images"}
+    located, unknown = ran.json["images"]
+    assert located.keys() == unknown.keys() == set(KEYS.split())
+    paths = [str(path) for path in sorted(images.iterdir())]
+    assert [located["path"], unknown["path"]] == paths
+    outcome = [located[key] for key in ("status", "reason", "scene", "unit")]
+    assert outcome == ["ok", "", "hall", "metres"]
     pose = located["base_from_camera"]
     truth = hall.test[7].base_from_camera
     assert pose.keys() == {"translation_m", "quaternion_wxyz", "matrix"}
     estimate = SE3(np.array(pose["quaternion_wxyz"]), np.array(pose["translation_m"]))
     np.testing.assert_allclose(pose["matrix"], estimate.matrix(), atol=1e-12)
-    assert truth is not None
     assert pose_distance(estimate, truth)[0] < 0.005
     assert np.shape(located["covariance"]) == (6, 6)
     assert located["inliers"] > 20
     terms = located["error_terms"]
-    variance = np.diag(located["covariance"])
     assert [term["name"] for term in terms] == CAUSES
     assert sum(term["share"] for term in terms) == pytest.approx(1)
-    mean = 1e6 * variance[:3].mean()
+    mean = 1e6 * np.diag(located["covariance"])[:3].mean()
     assert sum(term["translation_mm"] ** 2 for term in terms) == pytest.approx(mean)
     assert unknown["status"] in ("unknown_scene", "failed")
     assert unknown["reason"]
-    assert unknown["base_from_camera"] is unknown["covariance"] is None
+    assert (
+        unknown["base_from_camera"] is unknown["covariance"] is unknown["unit"] is None
+    )
     assert unknown["error_terms"] == []
-    assert (located["unit"], unknown["unit"]) == ("metres", None)
     assert min(located["ms"], unknown["ms"]) > 0
 
 
-def test_text_has_millimetres_and_the_next_command(
-    run: Any, hall_store: Path, images: Path
-) -> None:
+def test_text_has_millimetres_and_the_next_command(run, hall_store, images):
     files = sorted(images.iterdir())
-    [located, _] = json.loads(run("localize", hall_store, images, "--json").out)[
-        "images"
-    ]
+    [located, _] = run.json("localize", hall_store, images)["images"]
     lines = run("localize", hall_store, images).out.splitlines()
     assert lines[0] == str(files[0])
     assert lines[1].split() == ["scene", "hall"]
@@ -108,12 +76,10 @@ def test_text_has_millimetres_and_the_next_command(
     assert lines[-1] == f"next: evercal localize {hall_store} {files[0]} --overlay DIR"
 
 
-def test_point_in_the_camera_frame_has_a_standard_deviation(
-    run: Any, hall_store: Path, images: Path
-) -> None:
+def test_point_in_the_camera_frame_has_a_standard_deviation(run, hall_store, images):
     point = [-0.2, 0.1, 1.5]
-    ran = run("localize", hall_store, images, "--at", "-0.2,0.1,1.5", "--json")
-    located, unknown = json.loads(ran.out)["images"]
+    words = ("localize", hall_store, images, "--at -0.2,0.1,1.5")
+    located, unknown = run.json(*words)["images"]
     pose = SE3.from_matrix(np.array(located["base_from_camera"]["matrix"]))
     sigma = UncertainPose(pose, np.array(located["covariance"])).point_sigma_mm(point)
     at = located["at"]
@@ -121,21 +87,19 @@ def test_point_in_the_camera_frame_has_a_standard_deviation(
     np.testing.assert_allclose(at["in_parent_m"], pose.apply(np.array(point)))
     assert at["sigma_mm"] == pytest.approx(sigma)
     assert unknown["at"] is None
-    text = run("localize", hall_store, images, "--at", "-0.2,0.1,1.5").out
+    text = run(*words).out
     assert f"sd {sigma:.2f} mm at (-0.2, 0.1, 1.5) m in the camera frame" in text
 
 
-def test_exit_code_is_1_without_any_pose(
-    run: Any, hall_store: Path, images: Path
-) -> None:
+def test_exit_code_is_1_without_any_pose(run, hall_store, images):
     ran = run("localize", hall_store, images / "2-black.png")
     assert ran.code == 1
     assert ran.out.splitlines()[-1] == f"next: evercal learn {hall_store} RECORDING"
 
 
 def test_overlays_have_the_size_of_their_images(
-    run: Any, hall_store: Path, images: Path, hall: Recording, tmp_path: Path
-) -> None:
+    run, hall_store, images, hall, tmp_path
+):
     twin = tmp_path / "other" / "1-hall.png"
     out = tmp_path / "overlays"
     twin.parent.mkdir()
@@ -149,20 +113,18 @@ def test_overlays_have_the_size_of_their_images(
 
 
 def test_camera_file_replaces_the_camera_of_the_scene(
-    run: Any, hall_store: Path, images: Path, hall: Recording, tmp_path: Path
-) -> None:
+    run, hall_store, images, hall, tmp_path
+):
     camera = hall.test[7].camera
     image = images / "1-hall.png"
     (tmp_path / "camera.json").write_text(json.dumps(camera.to_dict()))
     matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
-    np.savetxt(
-        tmp_path / "longer.txt",
-        np.array(matrix) * [[1.2, 1, 1], [1, 1.2, 1], [1, 1, 1]],
-    )
+    longer = np.multiply(matrix, [[1.2, 1, 1], [1, 1.2, 1], [1, 1, 1]])
+    np.savetxt(tmp_path / "longer.txt", longer)
 
     def pose(*options: object) -> object:
         ran = run("localize", hall_store, image, "--json", *options)
-        return json.loads(ran.out)["images"][0]["base_from_camera"]
+        return ran.json["images"][0]["base_from_camera"]
 
     stated = pose("--camera", tmp_path / "camera.json")
     assert stated is not None
@@ -170,10 +132,10 @@ def test_camera_file_replaces_the_camera_of_the_scene(
 
 
 def test_video_holds_every_image_and_json_only_its_object(
-    run: Any, hall_store: Path, images: Path, tmp_path: Path
-) -> None:
+    run, hall_store, images, tmp_path
+):
     ran = run("localize", hall_store, images, "--video", tmp_path / "a.mp4", "--json")
-    rows = json.loads(ran.out)["images"]
+    rows = ran.json["images"]
     assert (ran.code, ran.err) == (0, [])
     video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
     frames = [image for ok, image in (video.read() for _ in range(9)) if ok]
@@ -185,8 +147,8 @@ def test_video_holds_every_image_and_json_only_its_object(
     "src/evercal/features", "src/evercal/localization", "src/evercal/cli/__init__.py"
 )
 def test_float32_gives_the_same_bytes_with_other_instructions(
-    hall_store: Path, hall: Recording, tmp_path: Path
-) -> None:
+    hall_store, hall, tmp_path
+):
     """Libraries choose kernels by the processor; older ones are emulated by their switches."""
     write_image(tmp_path / "image.png", np.asarray(hall.test[7].read_image()))
     older = {
@@ -213,12 +175,10 @@ def test_float32_gives_the_same_bytes_with_other_instructions(
     assert rows[0] == rows[1]
 
 
-def test_an_unreadable_image_has_a_row(
-    run: Any, hall_store: Path, images: Path
-) -> None:
+def test_an_unreadable_image_has_a_row(run, hall_store, images):
     (images / "0-cut.png").write_bytes((images / "1-hall.png").read_bytes()[:-200])
     (images / "._1-hall.png").write_bytes(b"hidden")
     ran = run("localize", hall_store, images, "--json")
-    cut, located, _ = json.loads(ran.out)["images"]
+    cut, located, _ = ran.json["images"]
     assert (ran.code, cut["status"], located["status"]) == (0, "failed", "ok")
     assert "0-cut.png: not a readable image" in cut["reason"]

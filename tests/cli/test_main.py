@@ -1,59 +1,26 @@
 """Help, version, messages, exit codes and output paths of all verbs."""
 
 import ast
-import json
+import itertools
 import os
 import re
 import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import evercal
-from evercal.cli import main
+from evercal.cli import VERBS, main
 
-VERBS = {
-    "Map": [
-        "learn",
-        "localize",
-        "track",
-        "view",
-        "refresh",
-        "evaluate",
-        "info",
-        "map",
-        "serve",
-    ],
-    "Calibrate": [
-        "studio",
-        "eye-to-hand",
-        "calibrate",
-        "check",
-        "watch",
-        "audit",
-        "align",
-    ],
-    "Boards and pose pairs": ["detect", "solve"],
-    "Results": ["export", "report"],
-    "Recordings": ["inspect", "convert", "reconstruct", "simulate", "demo"],
-    "Networks": ["bench"],
-}
-ALL = [verb for verbs in VERBS.values() for verb in verbs]
-OTHER_PROGRAMS = {
-    "--once",
-    "--frame-id",
-    "--child-frame-id",
-    "--qw",
-    "--qx",
-    "--qy",
-    "--qz",
-}
-OTHER_PROGRAMS |= {"--nproc-per-node", "--tyro-print-completion", "--version"}
+ALL = list(itertools.chain(*VERBS.values()))
+OTHER_PROGRAMS = (
+    "--once --frame-id --child-frame-id --qw --qx --qy --qz --nproc-per-node"
+)
+OTHER_PROGRAMS += " --tyro-print-completion --version"
 """Options in messages that are not those of a verb."""
-SOLVE = ("--robot-poses", "R", "--camera-poses", "C", "--mount", "eye_in_hand")
+SOLVE = "--robot-poses R --camera-poses C --mount eye_in_hand"
 
 
 def alone(*words: str) -> tuple[subprocess.CompletedProcess[str], set[str], float]:
@@ -70,7 +37,7 @@ def alone(*words: str) -> tuple[subprocess.CompletedProcess[str], set[str], floa
     return done, modules, time.perf_counter() - start
 
 
-def test_help_lists_every_verb_once_in_its_group() -> None:
+def test_help_lists_every_verb_once_in_its_group():
     done, modules, seconds = alone("--help")
     assert done.returncode == 0
     groups: dict[str, list[str]] = {}
@@ -86,9 +53,7 @@ def test_help_lists_every_verb_once_in_its_group() -> None:
 
 
 @pytest.mark.parametrize("verb", ALL)
-def test_help_of_a_verb_fits_and_has_an_example(
-    run: Any, verb: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_help_of_a_verb_fits_and_has_an_example(run, verb, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     ran = run(verb, "--help")
     assert (ran.code, ran.err) == (0, [])
@@ -102,13 +67,11 @@ def test_help_of_a_verb_fits_and_has_an_example(
         assert "--preset {fast,demo,bench,converged,paper}" in ran.out
 
 
-def test_messages_name_existing_options(
-    run: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_messages_name_existing_options(run, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    options = set(OTHER_PROGRAMS)
-    for words in [*([verb] for verb in ALL), ["map", "merge"]]:
-        page = run(*words, "--help").out
+    options = set(OTHER_PROGRAMS.split())
+    for words in (*ALL, "map merge"):
+        page = run(words, "--help").out
         options |= set(re.findall(r"^│ (?:-h, )?(--[a-z-]+)", page, re.MULTILINE))
     assert "--robot-poses" in options
     for path in Path(evercal.__file__).parent.rglob("*.py"):
@@ -126,33 +89,31 @@ def test_messages_name_existing_options(
         (["export", "missing.json", "--format", "urdf"], 2),
     ],
 )
-def test_help_and_misuse_do_without_torch(words: list[str], code: int) -> None:
+def test_help_and_misuse_do_without_torch(words, code):
     done, modules, _ = alone(*words)
     assert done.returncode == code
     assert not {"torch", "matplotlib"} & modules
 
 
-def test_version(run: Any) -> None:
+def test_version(run):
     assert run("--version").out == f"evercal {evercal.__version__}\n"
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["learn", "store"], "RECORDING"),
-        (["learn", "a", "b", "--seed", "x"], "--seed"),
-        (["learn", "a", "b", "--preset", "slow"], "--preset"),
-        (["detect", "x", "--board", "apriltag", "--camra", "c"], "--camera FILE"),
-        (["lern"], "lern: no such verb; did you mean 'learn'?"),
-        (["qqqq"], "'evercal --help' lists all verbs"),
+        ("learn store", "RECORDING"),
+        ("learn a b --seed x", "--seed"),
+        ("learn a b --preset slow", "--preset"),
+        ("detect x --board apriltag --camra c", "--camera FILE"),
+        ("lern", "lern: no such verb; did you mean 'learn'?"),
+        ("qqqq", "'evercal --help' lists all verbs"),
     ],
 )
-def test_unusable_arguments_are_an_error_object(
-    run: Any, words: list[str], message: str
-) -> None:
-    ran = run(*words, "--json")
+def test_unusable_arguments_are_an_error_object(run, words, message):
+    ran = run(words, "--json")
     assert ran.code == 2
-    assert message in json.loads(ran.out)["error"]
+    assert message in ran.json["error"]
     assert message in "".join(ran.err)
 
 
@@ -160,43 +121,41 @@ def test_unusable_arguments_are_an_error_object(
     ("words", "message"),
     [
         (
-            ["learn", "S", "R", "--calibration", "GONE/c.json"],
+            "learn S R --calibration GONE/c.json",
             "--calibration GONE/c.json: folder",
         ),
-        (["learn", "S", "R", "--calibration", "DIR"], "--calibration DIR: is a folder"),
+        ("learn S R --calibration DIR", "--calibration DIR: is a folder"),
         (
-            ["localize", "S", "IMAGE", "--overlay", "FILE/x"],
+            "localize S IMAGE --overlay FILE/x",
             "--overlay FILE/x: cannot be created",
         ),
         (
-            ["calibrate", "S", "IMAGE", "--out", "GONE/c.json"],
+            "calibrate S IMAGE --out GONE/c.json",
             "--out GONE/c.json: folder",
         ),
-        (["calibrate", "S", "IMAGE", "--out", "DIR"], "--out DIR: is a folder"),
+        ("calibrate S IMAGE --out DIR", "--out DIR: is a folder"),
         (
-            ["detect", "IMAGE", "--board", "apriltag", "--out", "GONE/b.json"],
+            "detect IMAGE --board apriltag --out GONE/b.json",
             "--out GONE/b.json",
         ),
-        (["solve", *SOLVE, "--out", "GONE/c.json"], "--out GONE/c.json: folder"),
-        (["report", "C", "--out", "GONE/r.html"], "--out GONE/r.html: folder"),
-        (["convert", "R", "FILE"], "FILE: is a file; give a folder"),
-        (["demo", "--out", "FILE/x"], "--out FILE/x: cannot be created"),
-        (["demo", "--copy-samples", "FILE"], "FILE: is a file; name a new folder"),
-        (["simulate", "cell", "--out", "FILE/x"], "FILE/x"),
-        (["bench", "sim-mini", "--out", "FILE/x"], "FILE/x"),
+        (f"solve {SOLVE} --out GONE/c.json", "--out GONE/c.json: folder"),
+        ("report C --out GONE/r.html", "--out GONE/r.html: folder"),
+        ("convert R FILE", "FILE: is a file; give a folder"),
+        ("demo --out FILE/x", "--out FILE/x: cannot be created"),
+        ("demo --copy-samples FILE", "FILE: is a file; name a new folder"),
+        ("simulate cell --out FILE/x", "FILE/x"),
+        ("bench sim-mini --out FILE/x", "FILE/x"),
     ],
 )
-def test_output_paths_are_refused_before_the_work(
-    run: Any, words: list[str], message: str, tmp_path: Path
-) -> None:
+def test_output_paths_are_refused_before_the_work(run, words, message, tmp_path):
     """The inputs do not exist, but the message is about the output."""
     (tmp_path / "FILE").write_text("x")
     (tmp_path / "DIR").mkdir()
     image = Path(evercal.__file__).parent / "recordings" / "sample_cell" / "bumped.jpg"
     message = re.sub("(GONE|DIR|FILE)", rf"{tmp_path}/\1", message)
-    given = [re.sub("^(GONE|DIR|FILE)", rf"{tmp_path}/\1", word) for word in words]
+    words = re.sub(r"(?<= )(GONE|DIR|FILE)", rf"{tmp_path}/\1", words)
     began = time.monotonic()
-    ran = run(*(image if word == "IMAGE" else word for word in given))
+    ran = run(words.replace("IMAGE", str(image)))
     assert (ran.code, ran.out) == (2, "")
     assert message in ran.err[-1]
     assert time.monotonic() - began < 10
@@ -213,7 +172,7 @@ def test_output_paths_are_refused_before_the_work(
         (["info", "x", "--json"], "x: no such folder"),
     ],
 )
-def test_full_disk_is_one_line(words: list[str], message: str) -> None:
+def test_full_disk_is_one_line(words, message):
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
             [sys.executable, "-m", "evercal", *words],
@@ -226,19 +185,18 @@ def test_full_disk_is_one_line(words: list[str], message: str) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_folder_without_permission_is_refused(run: Any, tmp_path: Path) -> None:
+def test_folder_without_permission_is_refused(run, tmp_path):
     tmp_path.chmod(0o500)
-    ran = run("demo", "--copy-samples", tmp_path / "samples")
-    assert (ran.code, len(ran.err)) == (2, 1)
+    run.refused("demo --copy-samples", tmp_path / "samples")
 
 
-def test_bugs_are_not_reported_as_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bugs_are_not_reported_as_bad_input(monkeypatch):
     monkeypatch.setitem(sys.modules, "tyro", None)  # a broken installation
     with pytest.raises(ImportError):
         main(["info", "x"])
 
 
-def test_closed_pipe_is_no_error() -> None:
+def test_closed_pipe_is_no_error():
     with subprocess.Popen(
         [sys.executable, "-m", "evercal", "--help"],
         stdout=subprocess.PIPE,

@@ -14,58 +14,52 @@ from evercal.storage import Manifest, write_manifest
 
 
 @pytest.fixture
-def copy(hall_store: Path, tmp_path: Path) -> Path:
+def copy(hall_store, tmp_path) -> Path:
     return Path(shutil.copytree(hall_store, tmp_path / "copy"))
 
 
 def scenes(run: Any, store: Path) -> list[str]:
-    ran = run("map", "list", store, "--json")
+    ran = run("map list", store, "--json")
     assert ran.code == 0
-    return [scene["name"] for scene in json.loads(ran.out)["scenes"]]
+    return [scene["name"] for scene in ran.json["scenes"]]
 
 
-def test_a_map_is_packed_unpacked_merged_renamed_and_emptied(
-    run: Any, copy: Path, tmp_path: Path
-) -> None:
-    ran = run("map", "list", copy)
+def test_a_map_is_packed_unpacked_merged_renamed_and_emptied(run, copy, tmp_path):
+    ran = run("map list", copy)
     assert ran.out.startswith("hall: 7 keyframes, ")
-    ran = run("map", "pack", copy, tmp_path / "hall.zip")
+    ran = run("map pack", copy, tmp_path / "hall.zip")
     assert (ran.code, ran.err) == (0, [])
     assert (
         ran.out.splitlines()[-1]
         == f"next: evercal map unpack {tmp_path / 'hall.zip'} MAP"
     )
-    record = json.loads(run("map", "pack", copy, tmp_path / "hall.zip", "--json").out)
+    record = run.json("map pack", copy, tmp_path / "hall.zip")
     assert record["bytes"] == (tmp_path / "hall.zip").stat().st_size
     two = tmp_path / "two"
-    ran = run("map", "unpack", tmp_path / "hall.zip", two, "--json")
-    assert json.loads(ran.out) == {"store": str(two), "scenes": ["hall"]}
-    assert run("map", "rename", two, "hall", "lobby").code == 0
-    record = json.loads(run("map", "merge", tmp_path / "new", copy, two, "--json").out)
+    ran = run("map unpack", tmp_path / "hall.zip", two, "--json")
+    assert ran.json == {"store": str(two), "scenes": ["hall"]}
+    assert run("map rename", two, "hall lobby").code == 0
+    record = run.json("map merge", tmp_path / "new", copy, two)
     assert record["added"] == record["scenes"] == ["hall", "lobby"]
-    ran = run("map", "merge", two, tmp_path / "new", "--on-clash", "rename")
+    ran = run("map merge", two, tmp_path / "new", "--on-clash rename")
     assert ran.out.startswith("added hall, lobby-2; lobby is now lobby-2; scenes of ")
     assert scenes(run, two) == ["lobby", "hall", "lobby-2"]
-    ran = run("map", "remove", two, "lobby", "lobby-2", "hall")
+    ran = run("map remove", two, "lobby lobby-2 hall")
     assert (ran.code, ran.out.splitlines()[0][-4:]) == (0, "none")
-    assert run("map", "list", two).out == f"{two}: no scene\n"
+    assert run("map list", two).out == f"{two}: no scene\n"
 
 
 @pytest.mark.parametrize(
     "action", ["list", "remove", "rename", "merge", "pack", "unpack"]
 )
-def test_help_of_an_action_has_an_example(
-    action: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help_of_an_action_has_an_example(action, capsys):
     assert main(["map", action, "--help"]) == 0
     page = capsys.readouterr().out
     assert f"Example: evercal map {action} " in page
     assert "--json" in page
 
 
-def test_control_characters_reach_no_terminal(
-    run: Any, copy: Path, four_images: Path, tmp_path: Path
-) -> None:
+def test_control_characters_reach_no_terminal(run, copy, four_images, tmp_path):
     images = tmp_path / "a\x1b]0;title\x07"
     images.mkdir()
     for number, path in enumerate(sorted(four_images.iterdir())[:2]):

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import urllib.request
-from pathlib import Path
 
 import pytest
 
@@ -15,9 +14,7 @@ pytest.importorskip("viser")
 
 
 @pytest.mark.parametrize("verb", ["view", "studio"])
-def test_it_serves_a_page_and_ends_cleanly(
-    verb: str, hall_store: Path, tmp_path: Path
-) -> None:
+def test_it_serves_a_page_and_ends_cleanly(verb, hall_store, tmp_path):
     words = {"view": [hall_store], "studio": ["--virtual", "--out", tmp_path / "s"]}[
         verb
     ]

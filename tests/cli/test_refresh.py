@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
 from evercal.recordings import generic
 
-if TYPE_CHECKING:
-    from evercal.recordings import Recording
-
 
 @pytest.mark.parametrize("form", ["recording", "images"])
 def test_the_stated_camera_is_used(
-    run: Any,
-    hall_store: Path,
-    hall: Recording,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    form: str,
-) -> None:
+    run,
+    hall_store,
+    hall,
+    tmp_path,
+    monkeypatch,
+    form,
+):
     from evercal.errors import InputError
     from evercal.map import Map
 

@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -17,9 +16,7 @@ from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.geometry import SE3, Camera
 from evercal.recordings import write_image
 
-if TYPE_CHECKING:
-    from evercal.recordings import Recording
-
+PACKAGES = {"serve": "fastapi", "view": "viser", "studio": "viser"}
 STRANGER = "holds networks of strategy finetune, and this needs a map"
 
 REFUSED = {
@@ -174,7 +171,7 @@ for _verb in ("localize MAP image.png", "calibrate MAP image.png", "report c.jso
 
 
 @pytest.fixture
-def folder(tmp_path: Path, hall: Recording, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, hall, monkeypatch) -> Path:
     """The working folder with what the commands name."""
     monkeypatch.chdir(tmp_path)
     Path("empty").mkdir()
@@ -200,31 +197,28 @@ def folder(tmp_path: Path, hall: Recording, monkeypatch: pytest.MonkeyPatch) -> 
     return tmp_path
 
 
-@pytest.mark.parametrize("words", REFUSED)
-def test_bad_input_is_one_line_and_writes_nothing(
-    run: Any,
-    hall_store: Path,
-    rooms: tuple[Path, Path],
-    request: pytest.FixtureRequest,
-    folder: Path,
-    snapshot: Any,
-    words: str,
-) -> None:
-    extra = {"serve": "fastapi", "view": "viser", "studio": "viser"}.get(
-        words.split()[0]
-    )
-    if extra:
-        pytest.importorskip(extra)
+@pytest.fixture
+def paths(hall_store, rooms, request, words) -> dict[str, Path]:
+    """Paths that words of a command stand for."""
     paths = {"MAP": hall_store, "ROOM": rooms[1]}
     if "NETWORKS" in words:
         paths["NETWORKS"] = request.getfixturevalue("network_store")
+    return paths
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_bad_input_is_one_line_and_writes_nothing(run, folder, paths, snapshot, words):
+    package = PACKAGES.get(words.split()[0])
+    if package:
+        pytest.importorskip(package)
     stores = {name: snapshot(path) for name, path in paths.items()}
     before = snapshot(folder)
     ran = run(*(paths.get(word, word) for word in words.split()), "--json")
-    assert (ran.code, len(ran.err)) == (2, 1)
-    assert ran.err[0].startswith("error: ")
-    assert REFUSED[words] in ran.err[0]
-    assert json.loads(ran.out) == {"error": ran.err[0].removeprefix("error: ")}
+    (line,) = ran.err
+    assert ran.code == 2
+    assert REFUSED[words] in line
+    assert line == f"error: {ran.json['error']}"
+    assert ran.json.keys() == {"error"}
     after = {name: snapshot(path) for name, path in paths.items()}
     for state in (before, *stores.values(), *after.values()):
         for name in [name for name in state if name.endswith(".lock")]:
@@ -233,6 +227,7 @@ def test_bad_input_is_one_line_and_writes_nothing(
     assert after == stores
 
 
+@pytest.mark.usefixtures("folder")
 @pytest.mark.parametrize(
     ("words", "package", "extra"),
     [
@@ -241,23 +236,14 @@ def test_bad_input_is_one_line_and_writes_nothing(
         ("studio --virtual --out s", "viser", "view"),
     ],
 )
-def test_a_missing_package_is_named(
-    run: Any,
-    hall_store: Path,
-    folder: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    words: str,
-    package: str,
-    extra: str,
-) -> None:
+def test_a_missing_package_is_named(run, paths, monkeypatch, words, package, extra):
     monkeypatch.setitem(sys.modules, package, None)
-    ran = run(*(hall_store if word == "MAP" else word for word in words.split()))
-    assert (ran.code, len(ran.err)) == (2, 1)
-    assert re.search(r" needs [\w.]+; in the checkout of evercal, run: ", ran.err[0])
-    assert f"constraints.txt '.[{extra}]'" in ran.err[0]
+    refusal = run.refused(*(paths.get(word, word) for word in words.split()))
+    assert re.search(r" needs [\w.]+; in the checkout of evercal, run: ", refusal)
+    assert f"constraints.txt '.[{extra}]'" in refusal
 
 
-def test_limits_hold_for_files_and_for_opencv(tmp_path: Path) -> None:
+def test_limits_hold_for_files_and_for_opencv(tmp_path):
     """In a process of its own: OpenCV reads its limit once, when it is loaded."""
     write_image(tmp_path / "a.png", np.zeros((40, 50, 3), np.uint8))
     command = [sys.executable, "-m", "evercal", "detect", str(tmp_path / "a.png")]

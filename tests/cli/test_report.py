@@ -1,9 +1,7 @@
 """`evercal report`: the HTML file, the JSON object and the error messages."""
 
-import json
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +21,7 @@ POSE = pose([0.0, 1.0, 0.0, 0.0], [0.1, 0.05, 1.0])
 
 
 @pytest.fixture
-def calibration(tmp_path: Path) -> Path:
+def calibration(tmp_path) -> Path:
     write_image(tmp_path / "a.png", np.full((48, 64, 3), 90, np.uint8))
     images = (
         ImageUse("a.png", True, "", 0.5, 0.01),
@@ -36,9 +34,7 @@ def calibration(tmp_path: Path) -> Path:
     return tmp_path / "c.json"
 
 
-def test_report_is_one_self_contained_file(
-    run: Any, calibration: Path, tmp_path: Path
-) -> None:
+def test_report_is_one_self_contained_file(run, calibration, tmp_path):
     ran = run("report", calibration, "--out", tmp_path / "r.html")
     assert ran.code == 0
     assert "Good for precision assembly" in ran.out
@@ -52,9 +48,7 @@ def test_report_is_one_self_contained_file(
     assert not re.search(r"(?:src|href)=\"(?!data:)|https?://", page)
 
 
-def test_json_with_an_older_calibration(
-    run: Any, calibration: Path, tmp_path: Path
-) -> None:
+def test_json_with_an_older_calibration(run, calibration, tmp_path):
     moved = SE3.exp([0.003, 0.0, 0.004, 0, 0, 0]) @ POSE
     Calibration("eye_to_hand", moved, 1e-8 * np.eye(6)).write(tmp_path / "old.json")
     out = tmp_path / "r.html"
@@ -67,7 +61,7 @@ def test_json_with_an_older_calibration(
         out,
     )
     ran = run("report", calibration, *words, "--json")
-    record = json.loads(ran.out)
+    record = ran.json
     assert ran.code == 0
     assert record["tier"] == "precision assembly"
     assert record["pictures"] == [str(tmp_path / "a.png")]
@@ -82,14 +76,12 @@ def test_json_with_an_older_calibration(
     ("camera", "message"),
     [(None, "no intrinsics"), (CAMERA, "names no images; pass some")],
 )
-def test_calibration_without_images_or_camera(
-    run: Any, tmp_path: Path, camera: Camera | None, message: str
-) -> None:
+def test_calibration_without_images_or_camera(run, tmp_path, camera, message):
     own = Calibration("eye_in_hand", POSE, 1e-4 * np.eye(6), "gripper", camera=camera)
     own.write(tmp_path / "s.json")
     ran = run("report", tmp_path / "s.json", "--out", tmp_path / "r.html", "--json")
     assert ran.code == 0
-    record = json.loads(ran.out)
+    record = ran.json
     assert record["tier"] is None
     assert record["pictures"] == []
     assert any(message in sentence for sentence in record["missing"])

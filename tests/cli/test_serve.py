@@ -52,8 +52,8 @@ def started(
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_requests_under_way_are_answered_before_the_end(
-    number: signal.Signals, hall_store: Path, still_images: Path
-) -> None:
+    number, hall_store, still_images
+):
     process, url = started(hall_store, EVERCAL_TOKEN="0123456789abcdef")
     with process:
         client = Client(url, "0123456789abcdef")
@@ -74,7 +74,7 @@ def test_requests_under_way_are_answered_before_the_end(
     assert len(answers[0].images) == 20
 
 
-def test_the_token_comes_from_a_file(hall_store: Path, tmp_path: Path) -> None:
+def test_the_token_comes_from_a_file(hall_store, tmp_path):
     (tmp_path / "token").write_text("0123456789abcdef\n")
     process, url = started(hall_store, "--token-file", str(tmp_path / "token"))
     with process:

@@ -2,27 +2,16 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 from evercal.recordings import load_recording
 
 
-def test_a_cell_has_the_stated_parts(run: Any, tmp_path: Path) -> None:
+def test_a_cell_has_the_stated_parts(run, tmp_path):
     out = tmp_path / "cell"
-    words = (
-        "--frames",
-        "3",
-        "--size",
-        "64x64",
-        "--seed",
-        "4",
-        "--noise",
-        "0",
-        "--json",
-    )
-    ran = run("simulate", "cell", "--out", out, *words)
+    words = ("--frames 3 --size 64x64 --seed 4 --noise 0 --json",)
+    ran = run("simulate cell --out", out, *words)
     assert ran.code == 0, ran.err
-    report = json.loads(ran.out)
+    report = ran.json
     assert (report["scenes"], report["frames"]) == ([str(out / "wrist")], 3 + 8 + 25)
     frames = load_recording(out / "wrist").train
     assert [frame.read_image().shape for frame in frames] == 3 * [(64, 64, 3)]

@@ -1,26 +1,18 @@
 """`evercal track` on the command line."""
 
-import json
 import time
 from collections.abc import Iterator
-from pathlib import Path
-
-import pytest
 
 from evercal.live import camera
-from evercal.recordings import Recording, streams
-
-from .conftest import Run
+from evercal.recordings import streams
 
 
-def test_a_folder_is_tracked_into_files(
-    run: Run, store: Path, rooms: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_a_folder_is_tracked_into_files(run, store, rooms, tmp_path):
     images = rooms[0] / "images"
     tum = tmp_path / "t.tum"
     lines = tmp_path / "t.jsonl"
     ran = run("track", store, images, "--out", tum, lines, "--most", 6, "--json")
-    report = json.loads(ran.out)
+    report = ran.json
     assert report["frames"] == 6
     assert report["tracking"] + report["relocalized"] + report["lost"] == 6
     assert ran.code == (0 if report["tracking"] + report["relocalized"] else 1)
@@ -30,12 +22,12 @@ def test_a_folder_is_tracked_into_files(
 
 
 def test_a_live_camera_is_tracked_in_its_newest_frames(
-    run: Run,
-    hall_store: Path,
-    hall: Recording,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    run,
+    hall_store,
+    hall,
+    tmp_path,
+    monkeypatch,
+):
     image = hall.test[3].read_image()
 
     def frames(source: str, rate: float) -> Iterator[streams.StreamFrame]:
@@ -45,6 +37,6 @@ def test_a_live_camera_is_tracked_in_its_newest_frames(
 
     for module in (streams, camera):
         monkeypatch.setattr(module, "stream", frames)
-    ran = run("track", hall_store, "0", "--out", tmp_path / "t.jsonl", "--json")
-    assert 1 <= json.loads(ran.out)["frames"] < 30
+    ran = run("track", hall_store, "0 --out", tmp_path / "t.jsonl", "--json")
+    assert 1 <= ran.json["frames"] < 30
     assert ran.code == 0

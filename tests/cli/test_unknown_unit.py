@@ -8,7 +8,7 @@ import json
 import re
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -18,8 +18,10 @@ from evercal.cli import main
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings import write_image
 
+from .conftest import words_of
+
 if TYPE_CHECKING:
-    from evercal.recordings import Frame, Recording
+    from evercal.recordings import Frame
 
 UNITS = 1.7
 """Units of length of the recording in a metre."""
@@ -32,7 +34,7 @@ def truth_of(frame: Frame) -> SE3:
 
 
 @pytest.fixture(scope="module")
-def phone(hall: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def phone(hall, tmp_path_factory) -> Path:
     """The training frames of `hall` as a nerfstudio recording."""
     root = tmp_path_factory.mktemp("units") / "phone"
     (root / "images").mkdir(parents=True)
@@ -45,24 +47,19 @@ def phone(hall: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
         frames.append(
             {"file_path": f"images/{i:03d}.png", "transform_matrix": matrix.tolist()}
         )
-    intrinsics = {
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-    }
-    intrinsics |= {"cx": camera.cx + 0.5, "cy": camera.cy + 0.5}
+    intrinsics = {"w": camera.width, "h": camera.height, "fl_x": camera.fx}
+    intrinsics |= {"fl_y": camera.fy, "cx": camera.cx + 0.5, "cy": camera.cy + 0.5}
     (root / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
     return root
 
 
 @pytest.fixture(scope="module")
-def phone_store(phone: Path) -> Path:
+def phone_store(phone) -> Path:
     """A map of `phone`, as scene `hall`; tests do not change it."""
     store = phone.parent / "phone.evercal"
-    words = ("learn", store, phone, "--name", "hall", "--memory", "25%")
+    words = ("learn", store, phone, "--name hall --memory 25%")
     with contextlib.redirect_stdout(io.StringIO()) as shown:
-        assert main([str(word) for word in words]) == 0
+        assert main(words_of(words)) == 0
     assert " mm" not in shown.getvalue()
     next_line = shown.getvalue().splitlines()[-1]
     assert next_line == f"next: evercal align {store} hall IMAGE... --robot-poses FILE"
@@ -70,40 +67,33 @@ def phone_store(phone: Path) -> Path:
 
 
 @pytest.fixture
-def reference(tmp_path: Path) -> Path:
+def reference(tmp_path) -> Path:
     Calibration("eye_to_hand", SE3.identity(), np.eye(6)).write(
         tmp_path / "reference.json"
     )
     return tmp_path / "reference.json"
 
 
-def test_calibrations_are_refused(
-    run: Any, phone_store: Path, four_images: Path, reference: Path, tmp_path: Path
-) -> None:
+def test_calibrations_are_refused(run, phone_store, four_images, reference, tmp_path):
     out = tmp_path / "c.json"
     for words in (
         ("calibrate", phone_store, four_images, "--out", out),
         ("check", phone_store, four_images, "--reference", reference),
         ("watch", phone_store, four_images, "--reference", reference, "--idle", "60"),
     ):
-        ran = run(*words)
-        assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-        assert "unit of length of its recording is unknown" in ran.err[0]
-        assert "run 'evercal align' first" in ran.err[0]
+        refusal = run.refused(*words)
+        assert "unit of length of its recording is unknown" in refusal
+        assert "run 'evercal align' first" in refusal
     assert not out.exists()
     episodes = tmp_path / "episodes"
     shutil.copytree(four_images, episodes / "one")
     np.savetxt(episodes / "one" / "base_from_camera.txt", np.eye(4))
-    ran = run("audit", phone_store, episodes)
-    assert (ran.code, ran.out, len(ran.err)) == (2, "", 1)
-    assert "run 'evercal align' first" in ran.err[0]
+    assert "run 'evercal align' first" in run.refused("audit", phone_store, episodes)
 
 
-def test_poses_have_no_millimetres(
-    run: Any, phone_store: Path, four_images: Path, hall: Recording
-) -> None:
-    words = ("localize", phone_store, four_images / "00.png", "--at", "0,0,1")
-    [image] = json.loads(run(*words, "--json").out)["images"]
+def test_poses_have_no_millimetres(run, phone_store, four_images, hall):
+    words = ("localize", phone_store, four_images / "00.png", "--at 0,0,1")
+    [image] = run.json(*words)["images"]
     assert (image["status"], image["unit"], image["at"]) == ("ok", "unknown", None)
     truth = UNITS * truth_of(hall.test[3]).translation_m
     np.testing.assert_allclose(
@@ -119,8 +109,8 @@ def test_poses_have_no_millimetres(
 
 
 def test_no_command_prints_a_length_in_metres(
-    run: Any, phone: Path, phone_store: Path, four_images: Path, tmp_path: Path
-) -> None:
+    run, phone, phone_store, four_images, tmp_path
+):
     wide = json.loads((phone / "transforms.json").read_text())
     for frame in wide["frames"]:
         for row in frame["transform_matrix"][:3]:
@@ -143,9 +133,7 @@ def test_no_command_prints_a_length_in_metres(
     )
 
 
-def test_alignment_gives_metres(
-    run: Any, phone_store: Path, four_images: Path, hall: Recording, tmp_path: Path
-) -> None:
+def test_alignment_gives_metres(run, phone_store, four_images, hall, tmp_path):
     """The scale is estimated without --unknown-scale."""
     store = Path(shutil.copytree(phone_store, tmp_path / "map"))
     rng = np.random.default_rng(0)
@@ -163,28 +151,22 @@ def test_alignment_gives_metres(
     (tmp_path / "points.csv").write_text("\n".join(touched))
     files = ("--points", tmp_path / "points.csv", "--picks", tmp_path / "picks.csv")
     (tmp_path / "fewer.csv").write_text("\n".join(touched[1:]))
-    refused = run(
-        "align", store, "hall", "--points", tmp_path / "fewer.csv", *files[2:]
-    )
+    refused = run("align", store, "hall --points", tmp_path / "fewer.csv", *files[2:])
     assert refused.code == 2
     assert f"point 'p0' is not in {tmp_path / 'fewer.csv'}" in refused.err[0]
     ran = run("align", store, "hall", *files, "--json")
     assert ran.code == 0, ran.err
-    assert json.loads(ran.out)["scale"] == pytest.approx(1 / UNITS, rel=0.01)
+    assert ran.json["scale"] == pytest.approx(1 / UNITS, rel=0.01)
     out = tmp_path / "c.json"
     assert run("calibrate", store, four_images, "--out", out).code == 0
     pose = read_calibration(out).parent_from_child
     assert pose_distance(pose, truth_of(hall.test[3]))[0] < 0.02
-    [image] = json.loads(run("localize", store, four_images / "00.png", "--json").out)[
-        "images"
-    ]
+    [image] = run.json("localize", store, four_images / "00.png")["images"]
     assert image["unit"] == "metres"
     assert image["error_terms"][0]["translation_mm"] > 0
 
 
-def test_unit_survives_conversion_and_can_be_stated(
-    run: Any, phone: Path, tmp_path: Path
-) -> None:
+def test_unit_survives_conversion_and_can_be_stated(run, phone, tmp_path):
     from evercal.recordings import load_recording
 
     assert run("convert", phone, tmp_path / "unknown").code == 0
@@ -194,11 +176,11 @@ def test_unit_survives_conversion_and_can_be_stated(
     stated = load_recording(tmp_path / "metres")
     assert stated.metric
     assert "unit of length" not in stated.notes[0]
-    ran = run("convert", tmp_path / "metres", tmp_path / "again", "--metres")
-    assert (ran.code, len(ran.err)) == (2, 1)
-    assert "--metres: not used by recordings of format generic" in ran.err[0]
+    assert "--metres: not used by recordings of format generic" in run.refused(
+        "convert", tmp_path / "metres", tmp_path / "again", "--metres"
+    )
     scene = tmp_path / "metres" / "scene.json"
     scene.write_text(json.dumps({**json.loads(scene.read_text()), "unit": "feet"}))
-    ran = run("inspect", tmp_path / "metres")
-    assert (ran.code, len(ran.err)) == (2, 1)
-    assert "'unit' is 'metres' or 'unknown', got 'feet'" in ran.err[0]
+    assert "'unit' is 'metres' or 'unknown', got 'feet'" in run.refused(
+        "inspect", tmp_path / "metres"
+    )

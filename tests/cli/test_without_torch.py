@@ -7,15 +7,11 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
 from evercal.recordings.images import write_image
 from evercal.storage.manifest import MANIFEST, write_manifest
-
-if TYPE_CHECKING:
-    from evercal.recordings import Recording
 
 WITHOUT = """
 import sys
@@ -35,9 +31,7 @@ def without_torch(*words: object) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture
-def meant(
-    hall_store: Path, rooms: tuple[Path, Path], still_images: Path, tmp_path: Path
-) -> dict[str, Path]:
+def meant(hall_store, rooms, still_images, tmp_path) -> dict[str, Path]:
     """Paths by word; the manifest of NETWORKS says that it holds networks."""
     root = Path(shutil.copytree(hall_store, tmp_path / "networks"))
     manifest = json.loads((root / MANIFEST).read_text())
@@ -58,13 +52,13 @@ def meant(
         "bench sim-mini",
     ],
 )
-def test_networks_name_the_extra(words: str, meant: dict[str, Path]) -> None:
+def test_networks_name_the_extra(words, meant):
     done = without_torch(*(meant.get(word, word) for word in words.split()))
     assert (done.returncode, done.stdout, done.stderr) == (2, "", EXTRA)
     assert not meant["NEW"].exists()
 
 
-def test_maps_need_no_torch(hall_store: Path, hall: Recording, tmp_path: Path) -> None:
+def test_maps_need_no_torch(hall_store, hall, tmp_path):
     write_image(tmp_path / "image.png", hall.test[7].read_image())
     done = without_torch("localize", hall_store, tmp_path / "image.png")
     assert done.returncode == 0, done.stderr

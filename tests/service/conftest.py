@@ -5,22 +5,17 @@ from __future__ import annotations
 import http.client
 import json
 import shutil
+import socket
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
 pytest.importorskip("fastapi")
-
-if TYPE_CHECKING:
-    from evercal.mapping.scene_map import MapContents
-    from evercal.recordings.frame import Recording
-
-Part = tuple[str, bytes] | str
 
 
 @dataclass(frozen=True)
@@ -34,6 +29,13 @@ class Answer:
     @property
     def json(self) -> Any:
         return json.loads(self.body)
+
+    @property
+    def refusal(self) -> tuple[int, str]:
+        """Status and error, which is the only entry and one line."""
+        ((key, error),) = self.json.items()
+        assert (key, "\n" in error) == ("error", False)
+        return self.status, error
 
 
 @dataclass(frozen=True)
@@ -50,23 +52,36 @@ class Running:
         """Protocols of the open connections."""
         return list(self.server.server_state.connections)
 
-    def ask(
-        self,
-        method: str,
-        path: str,
-        parts: Sequence[tuple[str, Part]] | None = None,
-        body: Any = None,
-        headers: dict[str, str] | None = None,
-    ) -> Answer:
+    def get(self, path: str, **headers: str) -> Answer:
+        return self.ask("GET", path, headers=headers)
+
+    def post(self, path: str, headers: Any = None, **parts: Any) -> Answer:
+        """Send a form; a path stands for the file, a list for several parts of one name."""
         from urllib3 import encode_multipart_formdata
 
-        headers = dict(headers or {})
-        if parts is not None:
-            body, headers["Content-Type"] = encode_multipart_formdata(list(parts))
+        fields = []
+        for name, values in parts.items():
+            for value in values if isinstance(values, list) else [values]:
+                if isinstance(value, Path):
+                    value = (value.name, value.read_bytes())
+                fields.append((name, value))
+        body, kind = encode_multipart_formdata(fields)
+        return self.ask("POST", path, body, {**(headers or {}), "Content-Type": kind})
+
+    def connected(self, data: bytes) -> socket.socket:
+        """A connection on which these bytes were sent."""
+        host, port = self.url.removeprefix("http://").split(":")
+        connection = socket.create_connection((host, int(port)), timeout=30)
+        connection.sendall(data)
+        return connection
+
+    def ask(
+        self, method: str, path: str, body: Any = None, headers: Any = None
+    ) -> Answer:
         address = self.url.removeprefix("http://")
         connection = http.client.HTTPConnection(address, timeout=60)
         try:
-            connection.request(method, path, body, headers)
+            connection.request(method, path, body, headers or {})
             got = connection.getresponse()
             return Answer(got.status, got.read(), dict(got.getheaders()))
         finally:
@@ -108,7 +123,7 @@ def serve() -> Serve:
 
 
 @pytest.fixture(scope="session")
-def hall_store(hall_map: MapContents, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def hall_store(hall_map, tmp_path_factory) -> Path:
     """A map of `hall`; tests do not change it."""
     from evercal.mapping.store import MapStore
 
@@ -118,19 +133,19 @@ def hall_store(hall_map: MapContents, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.fixture
-def copy(hall_store: Path, tmp_path: Path) -> Path:
+def copy(hall_store, tmp_path) -> Path:
     return Path(shutil.copytree(hall_store, tmp_path / "map"))
 
 
 @pytest.fixture(scope="session")
-def hall_service(hall_store: Path) -> Iterator[Running]:
+def hall_service(hall_store) -> Iterator[Running]:
     """A service whose map is not changed."""
     with running(hall_store) as service:
         yield service
 
 
 @pytest.fixture(scope="session")
-def image(hall: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def image(hall, tmp_path_factory) -> Path:
     """An image of the hall."""
     from evercal.recordings import write_image
 

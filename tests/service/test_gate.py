@@ -53,28 +53,21 @@ def connected(server: Any, path: str, **headers: str) -> bool:
         return False
 
 
-def test_only_the_printed_address_shows_the_page(server: Any) -> None:
+def test_only_the_printed_address_shows_the_page(server):
     key = server.key
     assert len(key) > 20
     assert server.url == f"http://127.0.0.1:{server.get_port()}/{key}/"
-    assert [
-        status(server, path) for path in (f"/{key}/", f"/{key}", f"/{key}/?a=b")
-    ] == [200] * 3
+    for path in ("/KEY/", "/KEY", "/KEY/?a=b"):
+        assert status(server, path.replace("KEY", key)) == 200, path
     assert status(server, f"/{key}/none.js") == 404
-    for path in (
-        "/",
-        "/index.html",
-        f"/{key[:-1]}/",
-        f"/{key}x/",
-        f"//{key}/",
-        f"/?{key}",
-    ):
-        assert status(server, path) == 403, path
+    for path in ("/", "/index.html", "/KEYx/", "//KEY/", "/?KEY"):
+        assert status(server, path.replace("KEY", key)) == 403, path
+    assert status(server, f"/{key[:-1]}/") == 403
     assert status(server, f"/{key}/", Host="rebound.example") == 403
     assert status(server, f"/{key}/", Origin="http://page.example") == 403
 
 
-def test_no_page_of_another_origin_connects(server: Any) -> None:
+def test_no_page_of_another_origin_connects(server):
     key = server.key
     here = f"http://127.0.0.1:{server.get_port()}"
     assert connected(server, f"/{key}", Origin=here)
@@ -87,7 +80,7 @@ def test_no_page_of_another_origin_connects(server: Any) -> None:
     assert status(server, f"/{key}/", **other) == 403
 
 
-def test_a_page_for_other_machines_takes_their_names_with_the_key() -> None:
+def test_a_page_for_other_machines_takes_their_names_with_the_key():
     started = start_server("0.0.0.0", 0, "page")
     try:
         assert started.url.startswith("http://127.0.0.1:")
@@ -102,7 +95,7 @@ def test_a_page_for_other_machines_takes_their_names_with_the_key() -> None:
         started.stop()
 
 
-def test_a_server_that_is_opened_otherwise_is_refused() -> None:
+def test_a_server_that_is_opened_otherwise_is_refused():
     before = websockets_server.serve
     with pytest.raises(InputError, match="viser"), gated("key", True):
         pass

@@ -4,36 +4,28 @@ from __future__ import annotations
 
 import threading
 import time
-from pathlib import Path
-from typing import Any
 
 from evercal.map import Map
 
 
-def test_changes_by_other_processes_are_noticed(
-    serve: Any, copy: Path, image: Path
-) -> None:
-    parts = [("image", (image.name, image.read_bytes()))]
+def test_changes_by_other_processes_are_noticed(serve, copy, image):
     with serve(copy) as service:
-        assert service.ask("POST", "/localize", parts).json["scene"] == "hall"
+        assert service.post("/localize", image=image).json["scene"] == "hall"
         Map.open(copy).rename("hall", "lobby")
         until = time.monotonic() + 10
-        while service.ask("GET", "/scenes").json["scenes"] != ["lobby"]:
+        while service.get("/scenes").json["scenes"] != ["lobby"]:
             assert time.monotonic() < until
             time.sleep(0.05)
-        assert service.ask("POST", "/localize", parts).json["scene"] == "lobby"
+        assert service.post("/localize", image=image).json["scene"] == "lobby"
         (copy / "manifest.json").write_text("{")
         time.sleep(0.7)
-        assert service.ask("POST", "/localize", parts).json["scene"] == "lobby"
+        assert service.post("/localize", image=image).json["scene"] == "lobby"
 
 
-def test_no_answer_mixes_two_states(
-    serve: Any, copy: Path, image: Path, tmp_path: Path
-) -> None:
+def test_no_answer_mixes_two_states(serve, copy, image, tmp_path):
     """A scene of the same place under two names replaces itself while images are located."""
-    parts = [("image", (image.name, image.read_bytes()))]
     with serve(copy) as service:
-        expected = service.ask("POST", "/localize", parts).json["base_from_camera"]
+        expected = service.post("/localize", image=image).json["base_from_camera"]
         stop = threading.Event()
 
         def rename() -> None:
@@ -46,7 +38,7 @@ def test_no_answer_mixes_two_states(
         changing = threading.Thread(target=rename)
         changing.start()
         try:
-            rows = [service.ask("POST", "/localize", parts).json for _ in range(10)]
+            rows = [service.post("/localize", image=image).json for _ in range(10)]
         finally:
             stop.set()
             changing.join()
@@ -55,15 +47,14 @@ def test_no_answer_mixes_two_states(
 
 
 def test_a_service_without_a_map_waits_for_its_first_scene(
-    serve: Any, tmp_path: Path, hall_store: Path, image: Path
-) -> None:
-    parts = [("image", (image.name, image.read_bytes()))]
+    serve, tmp_path, hall_store, image
+):
     with serve(tmp_path / "new") as service:
-        assert service.ask("GET", "/scenes").json == {"scenes": []}
-        got = service.ask("POST", "/localize", parts)
+        assert service.get("/scenes").json == {"scenes": []}
+        got = service.post("/localize", image=image)
         assert got.status == 400
         assert "no scene learned yet" in got.json["error"]
         assert not (tmp_path / "new").exists()
         Map.open(tmp_path / "new").merge(hall_store)
         service.service.live.refresh()
-        assert service.ask("POST", "/localize", parts).json["scene"] == "hall"
+        assert service.post("/localize", image=image).json["scene"] == "hall"

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import socket
 import threading
 from collections import Counter
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -24,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="module")
-def narrow(hall_store: Path) -> Iterator[Any]:
+def narrow(hall_store) -> Iterator[Any]:
     """A service whose images may be small only."""
     from .conftest import running
 
@@ -32,11 +30,9 @@ def narrow(hall_store: Path) -> Iterator[Any]:
         yield service
 
 
-def answer_to(url: str, data: bytes) -> tuple[int, bytes]:
+def answer_to(service: Any, data: bytes) -> tuple[int, bytes]:
     """Status and body of what comes back for raw bytes."""
-    host, port = url.removeprefix("http://").split(":")
-    with socket.create_connection((host, int(port)), timeout=30) as connection:
-        connection.sendall(data)
+    with service.connected(data) as connection:
         answer = b""
         while received := connection.recv(65536):
             answer += received
@@ -47,41 +43,37 @@ def answer_to(url: str, data: bytes) -> tuple[int, bytes]:
 def statuses(service: Any, seeds: range) -> Counter[int]:
     counts: Counter[int] = Counter()
     for seed in seeds:
-        status, body = answer_to(service.url, malformed(seed))
+        status, body = answer_to(service, malformed(seed))
         assert 400 <= status < 500, (seed, status, malformed(seed)[:200])
         if body != b"Invalid HTTP request received.":  # by the parser of HTTP
             error = json.loads(body)
             assert list(error) == ["error"], seed
             assert "\n" not in error["error"], seed
         counts[status] += 1
-    assert service.ask("GET", "/scenes").json == {"scenes": ["hall"]}
+    assert service.get("/scenes").json == {"scenes": ["hall"]}
     assert service.service.desk.waiting == 0
     return counts
 
 
-def test_malformed_requests(narrow: Any, image: Path) -> None:
+def test_malformed_requests(narrow, image):
     counts = statuses(narrow, range(50))
     assert {400, 404, 413, 415} <= counts.keys()
-    row = narrow.ask(
-        "POST", "/localize", [("image", (image.name, image.read_bytes()))]
-    ).json
+    row = narrow.post("/localize", image=image).json
     assert row["status"] == "ok"
 
 
 @pytest.mark.slow("src/evercal/service")
-def test_a_thousand_malformed_requests(narrow: Any) -> None:
+def test_a_thousand_malformed_requests(narrow):
     print(statuses(narrow, range(100, 1100)))  # noqa: T201
 
 
-def test_clients_that_vanish(narrow: Any, image: Path) -> None:
+def test_clients_that_vanish(narrow, image):
     """Connections are closed in the middle of a request, and before an answer."""
-    host, port = narrow.url.removeprefix("http://").split(":")
     body = b"POST /localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data;"
     body += b" boundary=edge\r\nContent-Length: 100000\r\n\r\n--edge\r\n"
 
     def vanish(data: bytes) -> None:
-        with socket.create_connection((host, int(port)), timeout=30) as connection:
-            connection.sendall(data)
+        narrow.connected(data).close()
 
     threads = [
         threading.Thread(target=vanish, args=(body[: 10 * i],)) for i in range(1, 20)
@@ -90,6 +82,6 @@ def test_clients_that_vanish(narrow: Any, image: Path) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    got = narrow.ask("POST", "/localize", [("image", (image.name, image.read_bytes()))])
+    got = narrow.post("/localize", image=image)
     assert got.json["status"] == "ok"
     assert narrow.service.desk.waiting == 0

@@ -79,9 +79,7 @@ def calibration(scene: str) -> Calibration:
     )
 
 
-def test_samples_are_on_disk_at_once_and_a_new_studio_goes_on(
-    cell: VirtualCell, tmp_path: Path
-) -> None:
+def test_samples_are_on_disk_at_once_and_a_new_studio_goes_on(cell, tmp_path):
     studio = studio_in(tmp_path, cell)
     assert [status(studio, step) for step in STEPS] == [
         "to do",
@@ -104,9 +102,7 @@ def test_samples_are_on_disk_at_once_and_a_new_studio_goes_on(
     assert status(again, "3 Learn") == "waits"
 
 
-def test_the_next_view_is_reachable_lowers_sigma_and_is_not_repeated(
-    cell: VirtualCell, tmp_path: Path
-) -> None:
+def test_the_next_view_is_reachable_lowers_sigma_and_is_not_repeated(cell, tmp_path):
     studio = studio_in(tmp_path, cell)
     studio.take_sample()
     reachable = studio.connection.devices.reachable
@@ -126,9 +122,7 @@ def test_the_next_view_is_reachable_lowers_sigma_and_is_not_repeated(
     assert not studio.bad_samples()
 
 
-def test_a_pose_out_of_reach_is_not_proposed_again(
-    cell: VirtualCell, tmp_path: Path
-) -> None:
+def test_a_pose_out_of_reach_is_not_proposed_again(cell, tmp_path):
     far = SE3.stack([SE3.from_translation((2.0, 0, 0.5))])
     farther = SE3.stack([SE3.from_translation((3.0, 0, 0.5))])
     studio = studio_in(tmp_path, cell, reachable=far, holding=farther)
@@ -139,9 +133,7 @@ def test_a_pose_out_of_reach_is_not_proposed_again(
     assert studio.next_view() is None
 
 
-def test_the_arm_moves_only_while_somebody_sees_it(
-    cell: VirtualCell, tmp_path: Path
-) -> None:
+def test_the_arm_moves_only_while_somebody_sees_it(cell, tmp_path):
     studio = studio_in(tmp_path, cell)
     looks = iter([True, True, True])
     studio.take_sample()
@@ -162,8 +154,8 @@ def test_the_arm_moves_only_while_somebody_sees_it(
 
 
 def test_without_reachable_poses_views_near_the_recorded_ones_are_proposed(
-    cell: VirtualCell, tmp_path: Path
-) -> None:
+    cell, tmp_path
+):
     studio = studio_in(tmp_path, cell, reachable=None)
     studio.take_sample()
     view = studio.next_view()
@@ -172,9 +164,7 @@ def test_without_reachable_poses_views_near_the_recorded_ones_are_proposed(
     assert 0.02 < metres < 1.0 or radians > 0.07
 
 
-def test_recording_by_itself_ends_complete_or_when_it_is_stopped(
-    cell: VirtualCell, tmp_path: Path
-) -> None:
+def test_recording_by_itself_ends_complete_or_when_it_is_stopped(cell, tmp_path):
     studio = studio_in(tmp_path, cell)
     done: list[float] = []
     studio.record(lambda _what, good, _total: done.append(good), lambda: len(done) >= 4)
@@ -186,7 +176,7 @@ def test_recording_by_itself_ends_complete_or_when_it_is_stopped(
     assert (status(studio, "2 Record"), status(studio, "3 Learn")) == ("done", "to do")
 
 
-def test_devices_that_give_nothing_are_named(cell: VirtualCell, tmp_path: Path) -> None:
+def test_devices_that_give_nothing_are_named(cell, tmp_path):
     (tmp_path / "images").mkdir()
     write_image(tmp_path / "images/0.png", cell.wrist_camera.read()[1])
     camera = StreamCamera(str(tmp_path / "images"))
@@ -216,7 +206,7 @@ def test_devices_that_give_nothing_are_named(cell: VirtualCell, tmp_path: Path) 
     assert not studio.can_move
 
 
-def test_an_image_of_a_moving_arm_is_refused(cell: VirtualCell, tmp_path: Path) -> None:
+def test_an_image_of_a_moving_arm_is_refused(cell, tmp_path):
     angles = iter(np.arange(0, 1, 0.01))
     turning = SimpleNamespace(
         base_from_gripper=lambda: SE3.exp([0, 0, 0, 0, 0, next(angles)])
@@ -227,9 +217,7 @@ def test_an_image_of_a_moving_arm_is_refused(cell: VirtualCell, tmp_path: Path) 
     assert studio.recorders["wrist"].frames == ()
 
 
-def test_images_of_the_fixed_camera_are_numbered_and_removed(
-    cell: VirtualCell, tmp_path: Path
-) -> None:
+def test_images_of_the_fixed_camera_are_numbered_and_removed(cell, tmp_path):
     studio = studio_in(tmp_path, cell)
     studio.take_sample()
     assert studio.take_fixed() == "Took image 0000.jpg."
@@ -261,8 +249,8 @@ class Cell:
 
 
 def test_samples_learned_again_replace_their_scene_and_no_other(
-    cell: VirtualCell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    cell, tmp_path, monkeypatch
+):
     opened: Any = Cell(tmp_path, "wrist", "wrist-2")
     monkeypatch.setattr(Map, "open", lambda *_, **__: opened)
     studio = studio_in(tmp_path, cell)
@@ -290,9 +278,7 @@ def test_samples_learned_again_replace_their_scene_and_no_other(
     assert opened.scenes == ("wrist", "wrist-2", "wrist-3")
 
 
-def test_a_held_thing_leads_from_an_empty_folder_to_the_fixed_camera(
-    tmp_path: Path,
-) -> None:
+def test_a_held_thing_leads_from_an_empty_folder_to_the_fixed_camera(tmp_path):
     """No map, no camera on the gripper: within 1 mm and 0.1 deg, and within the stated error."""
     cell = VirtualCell(3, CellOptions(width=320, height=240))
     studio = studio_in(tmp_path, cell, wrist_camera=None)
@@ -342,9 +328,7 @@ NEEDING_MORE = ("moveit_samples", "joint_offsets", "corrected_urdf", "lerobot")
 """Formats that need poses of a board, or offsets of joints."""
 
 
-def test_every_format_is_exported_or_says_why_not(
-    cell: VirtualCell, tmp_path: Path
-) -> None:
+def test_every_format_is_exported_or_says_why_not(cell, tmp_path):
     studio = studio_in(tmp_path, cell)
     pose = cell.truth.base_from_tripod
     covariance = 1e-6 * np.eye(6)
@@ -370,7 +354,7 @@ def ended(tasks: Tasks) -> None:
         time.sleep(0.01)
 
 
-def test_one_task_runs_at_a_time_and_failures_are_one_line() -> None:
+def test_one_task_runs_at_a_time_and_failures_are_one_line():
     tasks = Tasks(silent)
     go = threading.Event()
 
@@ -397,9 +381,7 @@ def test_one_task_runs_at_a_time_and_failures_are_one_line() -> None:
         assert (tasks.failed, tasks.message) == (True, text)
 
 
-def test_the_page_follows_a_task(
-    cell: VirtualCell, tmp_path: Path, caplog: Any
-) -> None:
+def test_the_page_follows_a_task(cell, tmp_path, caplog):
     page = StudioPage(studio_in(tmp_path, cell), "127.0.0.1", 0)
     try:
         assert page.tasks.start("taking a sample", page.studio.take_sample)

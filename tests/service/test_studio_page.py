@@ -24,9 +24,7 @@ from .browsing import click, seen_until, shot, visited
 
 
 @pytest.mark.slow("src/evercal/service/studio", "src/evercal/service/viewer")
-def test_from_an_empty_folder_to_both_calibrations(
-    browser: Any, tmp_path: Path
-) -> None:
+def test_from_an_empty_folder_to_both_calibrations(browser, tmp_path):
     """The exported mount and tripod are within 1 mm and 0.05 deg of the truth."""
     cell = VirtualCell(3, CellOptions(width=320, height=240))
     devices = Devices(
