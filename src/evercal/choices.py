@@ -52,3 +52,14 @@ ExportFormat = Literal[
     "lerobot",
 ]
 """Format of an exported calibration; the last three describe the arm."""
+FormatName = Literal[
+    "generic",
+    "7scenes",
+    "12scenes",
+    "nerfstudio",
+    "colmap",
+    "wrist",
+    "lerobot",
+    "rosbag",
+]
+"""Format of a recording."""

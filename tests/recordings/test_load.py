@@ -4,8 +4,9 @@ from typing import get_args
 
 import pytest
 
+from evercal.choices import FormatName
 from evercal.errors import InputError
-from evercal.recordings.load import FORMATS, FormatName
+from evercal.recordings.load import FORMATS
 from evercal.recordings.read_options import ReadOptions
 
 

@@ -11,9 +11,9 @@ if TYPE_CHECKING:
     from evercal.recordings.addresses import RecordingAt
 
 EVERY = 100
-"""Training frames of which one block is held out."""
+"""Training frames from the start of one block of held-out frames to the next."""
 BLOCK = 4
-"""Consecutive frames of a block that is held out."""
+"""Frames of a block, consecutive."""
 Named = TypeVar("Named", bound="Recording | RecordingAt")
 
 

@@ -4,25 +4,13 @@ import importlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Literal, TypeAlias
 
+from evercal.choices import FormatName
 from evercal.errors import InputError
 from evercal.recordings.frame import Recording, with_images
 from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import named_errors
 from evercal.typing import PathLike
-
-FormatName: TypeAlias = Literal[
-    "generic",
-    "7scenes",
-    "12scenes",
-    "nerfstudio",
-    "colmap",
-    "wrist",
-    "lerobot",
-    "rosbag",
-]
-"""Name of a format of recordings."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from evercal.typing import Image
 _LIVE = re.compile(r"\d+|/dev/\S+|(rtsp|rtsps|http|https|udp|tcp)://\S+")
 """Sources whose frames have the time of their arrival."""
 _MOST_UNREADABLE = 30
-"""Unreadable frames in a row after which a live source has ended."""
+"""A live source has ended after this many unreadable frames in a row."""
 
 
 class StreamFrame(NamedTuple):

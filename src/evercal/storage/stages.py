@@ -35,7 +35,7 @@ STAGES = "stages"
 REPORT = "report.json"
 """File of a stage."""
 _STAGE = re.compile(r"(\d{4,})-[\w.~-]*")
-"""Name of a stage: its number, and what the user calls it."""
+"""Name of a stage: its number and the name that the user gave."""
 _JOURNAL = ".writing"
 """File with the stages that a change adds and drops."""
 _NEW = Manifest({"stages": []}, {})
@@ -361,7 +361,7 @@ def _manifest(root: Path) -> Manifest:
 
 
 def _journal(root: Path, key: str) -> list[str]:
-    """Stages in `.writing`; none where another program has written it."""
+    """Stages in `.writing`; an empty list if another program has written the file."""
     try:
         names = json.loads((root / _JOURNAL).read_bytes())[key]
         return [name for name in names if _STAGE.fullmatch(name)]
