@@ -34,7 +34,7 @@ SMALLEST_EXTENT_M = 0.05
 LARGEST_REACH_M = 5.0
 """Largest plausible distance of a gripper from the base of its robot, metres."""
 MOST_CAMERAS_LISTED = 4
-"""Maximum number of intrinsics that are listed one by one. Beyond it, each image size has a line."""
+"""Maximum number of intrinsics that are listed one by one; of more, each image size has a line."""
 
 
 Owner = Literal["camera", "gripper", "none"]
