@@ -19,7 +19,7 @@ from evercal.localization.alignment import (
 from evercal.localization.intrinsics import NOT_STATED
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.localizer import Localizer
-from evercal.localization.pose_refinement import RefinedPose
+from evercal.localization.self_calibration import RefinedPose
 from evercal.mapping.landmarks import Landmarks
 from evercal.mapping.patches import cut_patches, image_pyramid, to_level
 from evercal.mapping.scene_map import MapContents

@@ -13,7 +13,8 @@ from evercal.localization.intrinsics import (
     STATED,
     IntrinsicsPrior,
 )
-from evercal.localization.pose_refinement import Observed, self_calibrated
+from evercal.localization.pose_refinement import Observed
+from evercal.localization.self_calibration import self_calibrated
 
 CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)
 

@@ -23,8 +23,8 @@ from evercal.localization.pose_refinement import (
     Observed,
     linearise,
     minimise,
-    self_calibrated,
 )
+from evercal.localization.self_calibration import self_calibrated
 from evercal.typing import Array
 
 CAMERA = Camera(640, 480, 520.0, 500.0, 322.0, 238.0)

@@ -25,16 +25,21 @@ from evercal.storage.tensors import load_tensors, save_tensors
 from evercal.typing import Array, Float32Array, Image
 
 WEIGHTS = Path(__file__).parent / "weights"
+"""Folder of the shipped networks and centroids."""
 ENCODER_FILE = WEIGHTS / "encoder-2.onnx"
+"""The shipped encoder of new maps."""
 Features = Callable[[Float32Array], Array]
 """A network: (h, w) grey values with mean 0 and deviation 1 -> (rows, columns, width) features.
 
 Cell (i, j) is centred on pixel (stride (j + 0.5) - 0.5, same for i)."""
 _TEACHER = "840d7d903caaa691"
-"""Digest of the weights of `encoder-1.onnx` as maps of before store them."""
+"""Digest of the weights of `encoder-1.onnx` as maps written by earlier versions store them."""
 _PROBE = 192, 256
 """Height and width of the image that stride and width are read from."""
 _FINGERPRINT_TOLERANCE = 0.02
+"""Maximum difference of features that a map's function may have on another machine."""
+_STRIDES = (1, 2, 4, 8, 16)
+"""Allowed sides of a cell, pixels."""
 
 
 class Encoder:
@@ -47,26 +52,30 @@ class Encoder:
         self.name = name
         self.function = function
         self.data = data
-        features = np.asarray(function(_standardised(_probe())))
-        if features.ndim != 3 or len(features) not in {
-            _PROBE[0] // s for s in (1, 2, 4, 8, 16)
-        }:
+        probe = _standardised(_probe())
+        features = np.asarray(function(probe))
+        rows = [_PROBE[0] // stride for stride in _STRIDES]
+        if features.ndim != 3 or len(features) not in rows:
             raise InputError(
                 f"encoder {name}: made {features.shape} from an image of {_PROBE} pixels; it must"
                 " make (rows, columns, channels) with a stride of 1, 2, 4, 8 or 16 pixels"
             )
         self.stride = _PROBE[0] // len(features)
         self.width = features.shape[2]
-        self.fingerprint = unit(features).mean((0, 1))[:8].round(4).tolist()
+        mean = unit(features).mean((0, 1))
+        self.fingerprint = mean[:8].round(4).tolist()
         self._centroids: Float32Array | None = None
         self._vlad: Vlad | None = None
 
     def __call__(self, grey: Image) -> Float32Array:
         """(h, w) -> (h // stride, w // stride, width) unit vectors."""
-        height, width = (side // self.stride * self.stride for side in grey.shape)
-        return unit(self.function(_standardised(grey[:height, :width])))
+        height, width = grey.shape
+        height -= height % self.stride
+        width -= width % self.stride
+        standardised = _standardised(grey[:height, :width])
+        return unit(self.function(standardised))
 
-    def encode(self, image: np.ndarray, short_side: int) -> Float32Array:
+    def encode(self, image: Image, short_side: int) -> Float32Array:
         """(rows, columns, width) features of an image (h, w) or (h, w, 3) at working size."""
         return self(working_grey(image, short_side))
 
@@ -98,30 +107,33 @@ class Encoder:
 
     def write(self, root: Path) -> tuple[str, ...]:
         """Write the network, and centroids that are not shipped; return the names of the files."""
-        stem = self.name.removesuffix(".onnx")
+        shipped = False
         if self.data:
-            first = f"{stem}.onnx"
-            write_bytes(root / first, self.data)
+            stem = self.name.removesuffix(".onnx")
+            network = f"{stem}.onnx"
+            vlad = f"{stem.replace('encoder', 'vlad', 1)}.safetensors"
+            write_bytes(root / network, self.data)
+            shipped = (WEIGHTS / self.name).exists()
         else:
-            first = "encoder.json"
-            record = {"function": self.name, "fingerprint": self.fingerprint}
-            write_bytes(root / first, json.dumps(record, indent=1).encode())
-        if self._centroids is None or (self.data and (WEIGHTS / self.name).exists()):
-            return (first,)
-        vlad = (
-            f"{stem.replace('encoder', 'vlad', 1) if self.data else 'vlad'}.safetensors"
-        )
+            network = "encoder.json"
+            vlad = "vlad.safetensors"
+            record = {
+                "function": self.name,
+                "fingerprint": self.fingerprint,
+            }
+            text = json.dumps(record, indent=1)
+            write_bytes(root / network, text.encode())
+        if self._centroids is None or shipped:
+            return (network,)
         save_tensors(root / vlad, {"centroids": self._centroids})
-        return first, vlad
+        return network, vlad
 
     def require_same(self, record: Any, path: Path) -> None:
         """Compare with a record of `write`; another function is an `InputError`."""
         stored = np.asarray(record["fingerprint"], float)
-        own = np.asarray(self.fingerprint)
-        if (
-            stored.shape != own.shape
-            or np.abs(stored - own).max() > _FINGERPRINT_TOLERANCE
-        ):
+        current = np.asarray(self.fingerprint)
+        same = stored.shape == current.shape
+        if not same or np.abs(stored - current).max() > _FINGERPRINT_TOLERANCE:
             raise InputError(
                 f"{path}: encoder {self.name} makes other features than"
                 f" {record['function']!r}, which the map was made with"
@@ -147,9 +159,11 @@ class _OnnxNetwork:
             network = self._read()
         try:
             network.setInput(grey[None, None])
-            return np.ascontiguousarray(network.forward()[0].transpose(1, 2, 0))
+            (channels,) = network.forward()
+            return np.ascontiguousarray(channels.transpose(1, 2, 0))
         except (cv2.error, ValueError) as error:
-            reason = " ".join(str(error).split())[:200]
+            words = str(error).split()
+            reason = " ".join(words)[:200]
             raise InputError(
                 f"encoder {self.name}: does not run on an image ({reason})"
             ) from None
@@ -170,7 +184,8 @@ class _OnnxNetwork:
                     try:
                         return cv2.dnn.readNetFromONNX(str(file), engine=engine)
                     except cv2.error as error:
-                        reason = " ".join(str(error).split())[:200]
+                        words = str(error).split()
+                        reason = " ".join(words)[:200]
             finally:
                 cv2.utils.logging.setLogLevel(level)
         raise InputError(
@@ -190,26 +205,29 @@ def load_encoder(
     elif isinstance(source, Path) or source is None:
         encoder = _of_file(stored or source or ENCODER_FILE)
     elif callable(source):
-        encoder = Encoder(source, getattr(source, "__name__", type(source).__name__))
+        name = getattr(source, "__name__", type(source).__name__)
+        encoder = Encoder(source, name)
     else:
         raise InputError(
             f"encoder {source!r}: give an ONNX file or a function on arrays"
         )
     if stored is not None and stored.suffix == ".json":
-        encoder.require_same(json.loads(stored.read_text()), stored)
+        record = json.loads(stored.read_text())
+        encoder.require_same(record, stored)
     return encoder
 
 
 def _of_file(path: Path) -> Encoder:
     if path.suffix == ".json":
-        name = json.loads(path.read_text())["function"]
+        record = json.loads(path.read_text())
+        name = record["function"]
         raise InputError(
             f"{path}: the map was made with the function {name!r}; give it as encoder"
         )
     if not path.is_file():
         raise InputError(f"encoder {path}: no such file")
     name, data = read_network(path)
-    # Maps of before hold weights of PyTorch.
+    # Maps written by earlier versions hold weights of PyTorch.
     if name is None and path.suffix == ".safetensors":
         raise InputError(
             f"encoder {path}: weights of a PyTorch module; export the module to an ONNX file or"
@@ -217,12 +235,14 @@ def _of_file(path: Path) -> Encoder:
         )
     network = _OnnxNetwork(data, str(path))
     if name is None:
-        return Encoder(
-            network, f"encoder-{hashlib.sha256(data).hexdigest()[:12]}.onnx", data
-        )
+        digest = hashlib.sha256(data).hexdigest()[:12]
+        return Encoder(network, f"encoder-{digest}.onnx", data)
     encoder = Encoder(network, name, data)
-    centroids = WEIGHTS / f"{Path(name).stem.replace('encoder', 'vlad')}.safetensors"
-    encoder.centroids = load_tensors(centroids)["centroids"].astype(np.float32)
+    stem = Path(name).stem
+    stem = stem.replace("encoder", "vlad")
+    tensors = load_tensors(WEIGHTS / f"{stem}.safetensors")
+    centroids = tensors["centroids"]
+    encoder.centroids = centroids.astype(np.float32)
     return encoder
 
 
@@ -233,25 +253,35 @@ def read_network(path: Path) -> tuple[str | None, bytes]:
             return None, b""
         path = WEIGHTS / "encoder-1.onnx"
     data = path.read_bytes()
-    shipped = (f.name for f in sorted(WEIGHTS.glob("*.onnx")) if f.read_bytes() == data)
-    return next(shipped, None), data
+    for shipped in sorted(WEIGHTS.glob("*.onnx")):
+        if shipped.read_bytes() == data:
+            return shipped.name, data
+    return None, data
 
 
 def _digest(arrays: Mapping[str, NDArray[np.generic]]) -> str:
     digest = hashlib.sha256()
     for name in sorted(arrays):
-        digest.update(name.encode() + arrays[name].tobytes())
+        values = arrays[name].tobytes()
+        digest.update(name.encode() + values)
     return digest.hexdigest()[:16]
 
 
 def _probe() -> Image:
-    noise = np.random.default_rng(0).integers(0, 256, _PROBE).astype(np.uint8)
-    return np.asarray(cv2.GaussianBlur(noise, (0, 0), 3.0), np.uint8)
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, _PROBE).astype(np.uint8)
+    blurred = cv2.GaussianBlur(noise, (0, 0), 3.0)
+    return np.asarray(blurred, np.uint8)
 
 
 def _standardised(grey: Image) -> Float32Array:
     """Mean 0 and deviation 1, which removes exposure and contrast."""
-    mean, deviation = (float(value[0, 0]) for value in cv2.meanStdDev(grey))
-    deviation *= (grey.size / max(grey.size - 1, 1)) ** 0.5
+    means, deviations = cv2.meanStdDev(grey)
+    mean = float(means[0, 0])
+    deviation = float(deviations[0, 0])
+    unbiased = grey.size / max(grey.size - 1, 1)
+    deviation *= unbiased**0.5
     scale = 1 / (deviation + 0.255)
-    return np.asarray(grey * np.float32(scale) - np.float32(mean * scale), np.float32)
+    standardised = grey * np.float32(scale)
+    standardised = standardised - np.float32(mean * scale)
+    return np.asarray(standardised, np.float32)

@@ -7,16 +7,21 @@ remain, but they are right where the encoder's cells mistake one square of a boa
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry import Camera
-from evercal.typing import Array, Float32Array, Image
+from evercal.typing import Array, Float32Array, Image, IntArray
 
-FEATURES, CONTRAST, RATIO = 1500, 0.01, 0.85
-"""SIFT features of an image, their contrast, and the ratio of distances in Lowe's test."""
-EPIPOLAR_PX, MIN_INLIERS = 1.0, 20
-"""Distance of a match from its epipolar line, and matches of a pair of images."""
+FEATURES = 1500
+"""Maximum number of SIFT features of an image."""
+CONTRAST = 0.01
+"""Minimum contrast of a feature."""
+RATIO = 0.85
+"""Maximum ratio of distances in Lowe's test."""
+EPIPOLAR_PX = 1.0
+"""Maximum distance of an inlier from its epipolar line, pixels."""
+MIN_INLIERS = 20
+"""Minimum number of inliers of a pair of images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +50,17 @@ def sift_features(image: Image) -> SiftFeatures:
     """Detect and describe features of a grey image (h, w)."""
     import cv2
 
-    sift = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=CONTRAST)
+    sift = cv2.SIFT.create(
+        nfeatures=FEATURES,
+        contrastThreshold=CONTRAST,
+    )
     points, descriptors = sift.detectAndCompute(image, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
     if not points:
         return SiftFeatures(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
-    shares = descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
-    return SiftFeatures(np.array([point.pt for point in points]), np.sqrt(shares))
+    total = descriptors.sum(1, keepdims=True)
+    shares = descriptors / np.maximum(total, 1e-9)
+    pixels = np.array([point.pt for point in points])
+    return SiftFeatures(pixels, np.sqrt(shares))
 
 
 def epipolar_pair(
@@ -69,16 +79,21 @@ def epipolar_pair(
     if min(len(a.pixels), len(b.pixels)) < MIN_INLIERS:
         return None
     rows, matched = _distinct_matches(a.descriptors, b.descriptors)
+    pixels_a = a.pixels[rows]
+    pixels_b = b.pixels[matched]
     # Undistorted here, so that PoseLib needs no camera model.
-    ideal_a = first.unproject(a.pixels[rows])[:, :2] * first.fx
-    ideal_b = second.unproject(b.pixels[matched])[:, :2] * second.fx
-    moved = np.linalg.norm(a.pixels[rows] - b.pixels[matched], axis=1)
-    valid = np.isfinite(ideal_a + ideal_b).all(1) & (moved >= least_px)
+    ideal_a = first.unproject(pixels_a)[:, :2] * first.fx
+    ideal_b = second.unproject(pixels_b)[:, :2] * second.fx
+    moved_px = np.linalg.norm(pixels_a - pixels_b, axis=1)
+    valid = np.isfinite(ideal_a + ideal_b).all(1)
+    valid &= moved_px >= least_px
     if valid.sum() < MIN_INLIERS:
         return None
+    ideal_a = ideal_a[valid]
+    ideal_b = ideal_b[valid]
     pose, info = poselib.estimate_relative_pose(
-        ideal_a[valid],
-        ideal_b[valid],
+        ideal_a,
+        ideal_b,
         _ideal(first),
         _ideal(second),
         {"max_epipolar_error": EPIPOLAR_PX},
@@ -86,26 +101,36 @@ def epipolar_pair(
     )
     if info["num_inliers"] < MIN_INLIERS:
         return None
-    direction = np.asarray(pose.t) / max(float(np.linalg.norm(pose.t)), 1e-12)
-    inliers = np.flatnonzero(np.asarray(info["inliers"], bool))
-    plane = np.stack(
-        [ideal_a[valid][inliers] / first.fx, ideal_b[valid][inliers] / second.fx]
+    length = float(np.linalg.norm(pose.t))
+    direction = np.asarray(pose.t) / max(length, 1e-12)
+    inliers = np.asarray(info["inliers"], bool)
+    inliers = np.flatnonzero(inliers)
+    plane_a = ideal_a[inliers] / first.fx
+    plane_b = ideal_b[inliers] / second.fx
+    rays = np.ones((2, len(inliers), 3))
+    rays[0, :, :2] = plane_a
+    rays[1, :, :2] = plane_b
+    return EpipolarPair(
+        rotation=Rotation.from_matrix(pose.R),
+        direction=direction,
+        rays=rays,
     )
-    rays = np.concatenate([plane, np.ones((2, len(inliers), 1))], 2)
-    return EpipolarPair(Rotation.from_matrix(pose.R), direction, rays)
 
 
-def _distinct_matches(
-    a: Float32Array, b: Float32Array
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _distinct_matches(a: Float32Array, b: Float32Array) -> tuple[IntArray, IntArray]:
     similar = a @ b.T
     best = similar.argmax(1)
+    best_of_b = similar.argmax(0)
     rows = np.arange(len(a))
     top = similar[rows, best].copy()
-    mutual = similar.argmax(0)[best] == rows
+    mutual = best_of_b[best] == rows
     similar[rows, best] = -1
     second = similar.max(1)
-    distinct = np.maximum(2 - 2 * top, 0) < RATIO**2 * np.maximum(2 - 2 * second, 1e-9)
+    nearest = 2 - 2 * top
+    nearest = np.maximum(nearest, 0)
+    next_nearest = 2 - 2 * second
+    next_nearest = np.maximum(next_nearest, 1e-9)
+    distinct = nearest < RATIO**2 * next_nearest
     good = np.flatnonzero(mutual & distinct)
     return good, best[good]
 

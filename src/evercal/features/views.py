@@ -4,7 +4,7 @@ An augmented view is the image of a camera with another rotation and focal lengt
 centre. That image does not depend on the depths, so its pose is exact.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.recordings.frame import Frame
+from evercal.typing import Array, BoolArray, Image
 
 
 @dataclass(frozen=True)
@@ -34,34 +35,37 @@ class ViewOptions:
 class View:
     """One image for the encoder and the rays of its cells."""
 
-    grey: np.ndarray
-    cell_pixels: np.ndarray
+    grey: Image
+    cell_pixels: Array
     """(cells, 2) float32 pixels of the frame at the cell centres, in an ideal pinhole camera with
     `intrinsics`; row-major over the (h // stride, w // stride) grid."""
-    valid: np.ndarray
+    valid: BoolArray
     """(cells,) bool: the cell shows a part of the image."""
-    intrinsics: np.ndarray
+    intrinsics: Array
     """(4,) fx, fy, cx, cy of the ideal pinhole, pixels."""
     base_from_camera: SE3
     """Pose of the frame; identity without a pose."""
 
 
-def cell_centres(height: int, width: int, stride: int) -> np.ndarray:
+def cell_centres(height: int, width: int, stride: int) -> Array:
     """(cells, 2) pixels (u, v) of the cell centres, row-major."""
-    v, u = np.mgrid[0 : height // stride, 0 : width // stride]
-    return np.stack([u, v], -1).reshape(-1, 2) * float(stride) + (stride - 1) / 2
+    rows = height // stride
+    columns = width // stride
+    v, u = np.mgrid[0:rows, 0:columns]
+    cells = np.stack([u, v], -1).reshape(-1, 2)
+    return cells * float(stride) + (stride - 1) / 2
 
 
 @lru_cache(maxsize=64)
-def ideal_cell_pixels(camera: Camera, stride: int) -> np.ndarray:
+def ideal_cell_pixels(camera: Camera, stride: int) -> Array:
     """(cells, 2) float32 pixels of the cell centres after removing the distortion.
 
     NaN where the distortion has no ray for a cell. The array is shared and cannot be written.
     """
     pixels = cell_centres(camera.height, camera.width, stride)
     if camera.distortion:
-        rays = camera.unproject(pixels)
-        pixels = rays[:, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        plane = camera.unproject(pixels)[:, :2]
+        pixels = _on_image(plane, camera)
     pixels = pixels.astype(np.float32)
     pixels.flags.writeable = False
     return pixels
@@ -72,8 +76,13 @@ def frame_view(frame: Frame, stride: int, options: ViewOptions) -> View:
     grey, camera = working_image(frame.read_image(), frame.camera, options.short_side)
     pixels = ideal_cell_pixels(camera, stride)
     valid = np.asarray(np.isfinite(pixels).all(axis=1))
+    pose = frame.base_from_camera or SE3.identity()
     return View(
-        grey, pixels, valid, _four(camera), frame.base_from_camera or SE3.identity()
+        grey=grey,
+        cell_pixels=pixels,
+        valid=valid,
+        intrinsics=_four(camera),
+        base_from_camera=pose,
     )
 
 
@@ -90,66 +99,103 @@ def augmented_view(
     zoom = options.zoom ** rng.uniform(-1, 1)
     roll = np.deg2rad(options.roll_deg)
     tilt = np.deg2rad(options.tilt_deg)
-    rotation = SE3.exp(
-        np.array([0, 0, 0, *(rng.uniform(-1, 1, 3) * [tilt, tilt, roll])])
-    )
+    rotvec = rng.uniform(-1, 1, 3)
+    rotvec = rotvec * [tilt, tilt, roll]
+    tangent = np.array([0, 0, 0, *rotvec])
+    rotation = SE3.exp(tangent)
     camera_from_view = rotation.rotation_matrix()
     height, width = grey.shape
-    virtual = Camera(
-        width, height, zoom * camera.fx, zoom * camera.fy, camera.cx, camera.cy
-    )
-    homography = camera.matrix() @ camera_from_view @ np.linalg.inv(virtual.matrix())
-    ray = virtual.unproject(cell_centres(height, width, stride)) @ camera_from_view.T
+    virtual = camera.zoomed(zoom)
+    virtual = replace(virtual, distortion=(), model="pinhole")
     if camera.distortion:
         v, u = np.mgrid[0:height, 0:width]
-        rays = (
-            virtual.unproject(np.stack([u, v], -1).astype(float)) @ camera_from_view.T
+        places = np.stack([u, v], -1).astype(float)
+        rays = virtual.unproject(places) @ camera_from_view.T
+        source = camera.project(rays)
+        source = np.nan_to_num(source, nan=-1.0)
+        source = source.astype(np.float32)
+        warped = cv2.remap(
+            grey,
+            source,
+            None,  # type: ignore[call-overload]
+            interpolation=cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REFLECT,
         )
-        source = np.nan_to_num(camera.project(rays), nan=-1.0).astype(np.float32)
-        border = cv2.BORDER_REFLECT
-        warped = cv2.remap(grey, source, None, cv2.INTER_LINEAR, borderMode=border)  # type: ignore[call-overload]
     else:
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        size = (width, height)
-        border = cv2.BORDER_REFLECT
+        view_from_pixels = np.linalg.inv(virtual.matrix())
+        homography = camera.matrix() @ camera_from_view @ view_from_pixels
         warped = cv2.warpPerspective(
-            grey, homography, size, flags=flags, borderMode=border
+            grey,
+            homography,
+            (width, height),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REFLECT,
         )
-    table = (np.arange(256) / 255.0) ** np.exp(rng.normal(0, options.gamma)) * 255
+    exponent = np.exp(rng.normal(0, options.gamma))
+    linear = np.arange(256) / 255.0
+    table = linear**exponent * 255
     warped = cv2.LUT(warped, table.astype(np.uint8))
+    centres = cell_centres(height, width, stride)
+    ray = virtual.unproject(centres) @ camera_from_view.T
     source = camera.project(ray)
-    valid = np.all((source >= 0) & (source <= [width - 1, height - 1]), axis=-1)
+    inside = (source >= 0) & (source <= [width - 1, height - 1])
     plane = ray[:, :2] / ray[:, 2:]
-    pixels = plane * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    pixels = _on_image(plane, camera)
     assert frame.base_from_camera is not None, "augmented frames have poses"
     return View(
-        warped, pixels.astype(np.float32), valid, _four(camera), frame.base_from_camera
+        grey=np.asarray(warped, np.uint8),
+        cell_pixels=pixels.astype(np.float32),
+        valid=np.all(inside, axis=-1),
+        intrinsics=_four(camera),
+        base_from_camera=frame.base_from_camera,
     )
 
 
 def working_image(
-    image: np.ndarray, camera: Camera, short_side: int
-) -> tuple[np.ndarray, Camera]:
+    image: Image, camera: Camera, short_side: int
+) -> tuple[Image, Camera]:
     """Grey (h, w) uint8 image with the given shorter side, and its camera.
 
     The image, (h, w, 3) uint8 RGB or (h, w) grey, may have any size with the camera's aspect ratio.
     """
     import cv2
 
-    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    grey = image
+    if image.ndim == 3:
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     small = camera.short_side_resized(short_side)
+    size = small.width, small.height
     if grey.shape != (small.height, small.width):
-        shrink = small.height < grey.shape[0]
-        kind = cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
-        grey = cv2.resize(grey, (small.width, small.height), interpolation=kind)
-    return grey, small
+        kind = cv2.INTER_LINEAR
+        if small.height < grey.shape[0]:
+            kind = cv2.INTER_AREA
+        grey = cv2.resize(grey, size, interpolation=kind)
+    return np.asarray(grey, np.uint8), small
 
 
-def working_grey(image: np.ndarray, short_side: int) -> np.ndarray:
+def working_grey(image: Image, short_side: int) -> Image:
     """Grey (h, w) uint8 image with the given shorter side, see `working_image`."""
     height, width = image.shape[:2]
-    return working_image(image, Camera(width, height, 1, 1, 0, 0), short_side)[0]
+    camera = Camera(
+        width,
+        height,
+        fx=1,
+        fy=1,
+        cx=0,
+        cy=0,
+    )
+    grey, _ = working_image(image, camera, short_side)
+    return grey
 
 
-def _four(camera: Camera) -> np.ndarray:
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+def _on_image(plane: Array, camera: Camera) -> Array:
+    """Pixels (n, 2) of points of the plane z = 1, without distortion."""
+    focal = [camera.fx, camera.fy]
+    centre = [camera.cx, camera.cy]
+    return plane * focal + centre
+
+
+def _four(camera: Camera) -> Array:
+    """(4,) fx, fy, cx, cy."""
+    four = [camera.fx, camera.fy, camera.cx, camera.cy]
+    return np.array(four, np.float32)

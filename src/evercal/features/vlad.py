@@ -12,10 +12,13 @@ import numpy as np
 from evercal.typing import Array, Float32Array
 
 CENTROIDS = 16
+"""Number of centroids."""
 WIDTH = 1024
+"""Maximum length of the vector of an image."""
 _ROUNDS = 15
+"""Iterations of k-means."""
 _ROWS = 40_000
-"""Features that centroids are fitted to, at most."""
+"""Maximum number of features that centroids are fitted to."""
 
 
 class Vlad:
@@ -27,26 +30,31 @@ class Vlad:
     def __init__(self, centroids: Float32Array):
         self.centroids = centroids
         size = centroids.size
-        self._projection = _random_projection(size) if size > WIDTH else None
+        self._projection = None
+        if size > WIDTH:
+            self._projection = _random_projection(size)
 
     def __call__(self, features: Float32Array) -> Float32Array:
         """(cells, channels) unit vectors of an image -> unit vector of at most `WIDTH` numbers."""
         sums = _sums(features, self.centroids, self.centroids)
         vector = unit(sums).ravel()
-        return unit(vector if self._projection is None else vector @ self._projection)
+        if self._projection is not None:
+            vector = vector @ self._projection
+        return unit(vector)
 
 
 def fit_centroids(features: Sequence[Float32Array]) -> Float32Array:
     """(k, channels) centroids of unit features (cells, channels) of images, spherical k-means."""
-    rows = np.concatenate(list(features)).astype(np.float32)
-    rows = np.random.default_rng(0).permutation(rows)[:_ROWS]
+    rows = np.concatenate(list(features))
+    rows = rows.astype(np.float32)
+    rng = np.random.default_rng(0)
+    rows = rng.permutation(rows)[:_ROWS]
     centroids = rows[:CENTROIDS]
     for _ in range(_ROUNDS):
         sums = _sums(rows, centroids)
         # A centroid without members stays where it is.
-        centroids = np.where(
-            np.abs(sums).sum(1, keepdims=True) > 0, unit(sums), centroids
-        )
+        size = np.abs(sums).sum(1, keepdims=True)
+        centroids = np.where(size > 0, unit(sums), centroids)
     return centroids
 
 
@@ -54,30 +62,41 @@ def _sums(
     rows: Float32Array, centroids: Float32Array, origin: Float32Array | None = None
 ) -> Float32Array:
     """(k, channels) sums of the rows nearest to each centroid, as differences from an origin."""
-    nearest = (rows @ centroids.T).argmax(1)
-    member = np.zeros((len(centroids), len(rows)), np.float32)
+    similarity = rows @ centroids.T
+    nearest = similarity.argmax(1)
+    member = np.zeros(similarity.shape[::-1], np.float32)
     member[nearest, np.arange(len(rows))] = 1
     sums = member @ rows
-    return sums if origin is None else sums - member.sum(1, keepdims=True) * origin
+    if origin is None:
+        return sums
+    counts = member.sum(1, keepdims=True)
+    return sums - counts * origin
 
 
 def unit(vectors: Array) -> Float32Array:
     """Vectors (..., n) of unit length."""
-    length = np.sqrt(np.einsum("...c,...c->...", vectors, vectors))[..., None]
-    return np.asarray(vectors / np.maximum(length, 1e-12), np.float32)
+    squares = np.einsum("...c,...c->...", vectors, vectors)
+    length = np.sqrt(squares)
+    length = np.maximum(length, 1e-12)
+    return np.asarray(vectors / length[..., None], np.float32)
 
 
 def _random_projection(size: int) -> Float32Array:
     """(size, WIDTH) fixed random projection, which preserves angles: Box-Muller by blocks of 16."""
     # The numbers are part of every map that was ever made with a projection.
     count = size * WIDTH
-    bits = np.random.RandomState(1).randint(0, 2**32, count, dtype=np.uint32)
-    uniform = (
-        ((bits & 0xFFFFFF) * np.float32(2**-24)).astype(np.float32).reshape(-1, 2, 8)
-    )
-    radius = np.sqrt(-2 * np.log1p(-uniform[:, 0])) / np.float32(size) ** 0.5
+    rng = np.random.RandomState(1)
+    bits = rng.randint(0, 2**32, count, dtype=np.uint32)
+    uniform = (bits & 0xFFFFFF) * np.float32(2**-24)
+    uniform = uniform.astype(np.float32)
+    uniform = uniform.reshape(-1, 2, 8)
+    squares = -2 * np.log1p(-uniform[:, 0])
+    radius = np.sqrt(squares)
+    radius = radius / np.float32(size) ** 0.5
     angle = np.float32(2 * np.pi) * uniform[:, 1]
-    normal = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
+    x = radius * np.cos(angle)
+    y = radius * np.sin(angle)
+    normal = np.stack([x, y], 1)
     return np.asarray(normal, np.float32).reshape(size, WIDTH)
 
 
@@ -88,9 +107,13 @@ def similar_pairs(
     descriptors = np.stack([vlad(rows) for rows in features])
     similarity = descriptors @ descriptors.T
     np.fill_diagonal(similarity, -np.inf)
-    nearest = np.argsort(-similarity, 1, kind="stable")[
-        :, : min(partners, len(features) - 1)
-    ]
-    return sorted(
-        {(min(i, j), max(i, j)) for i, row in enumerate(nearest.tolist()) for j in row}
-    )
+    count = min(partners, len(features) - 1)
+    order = np.argsort(-similarity, 1, kind="stable")
+    nearest = order[:, :count].tolist()
+    pairs = set()
+    for i, row in enumerate(nearest):
+        for j in row:
+            first = min(i, j)
+            second = max(i, j)
+            pairs.add((first, second))
+    return sorted(pairs)

@@ -40,13 +40,20 @@ def support(inliers: int, expected: int) -> float:
     a, b = CHANCE
     more = np.arange(k, n - 1e-6)
     # Logarithms of the probabilities of k, k + 1, ... n inliers, relative to that of k.
-    binomial = (n - more) / (more + 1)
-    steps = np.log(binomial * (more + a) / (n - more - 1 + b))
-    relative = np.r_[0.0, np.cumsum(steps)]
+    rest = n - more
+    ratios = rest / (more + 1)
+    ratios = ratios * (more + a)
+    ratios = ratios / (rest - 1 + b)
+    relative = np.cumsum(np.log(ratios))
+    relative = np.r_[0.0, relative]
     largest = relative.max()
-    tail = largest + math.log(np.exp(relative - largest).sum())
-    combinations = math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
-    first = combinations + _log_beta(k + a, n - k + b) - _log_beta(a, b)
+    total = np.exp(relative - largest).sum()
+    tail = largest + math.log(total)
+    first = math.lgamma(n + 1)
+    first -= math.lgamma(k + 1)
+    first -= math.lgamma(n - k + 1)
+    first += _log_beta(k + a, n - k + b)
+    first -= _log_beta(a, b)
     return max(0.0, -(first + tail) / math.log(10))
 
 

@@ -14,10 +14,9 @@ from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import (
     Observed,
     Pose,
-    RefinedPose,
     minimise,
-    self_calibrated,
 )
+from evercal.localization.self_calibration import RefinedPose, self_calibrated
 from evercal.mapping.landmarks import project_surface
 from evercal.mapping.patches import (
     Patches,
@@ -61,9 +60,27 @@ class AlignmentOptions:
     """How landmarks are searched in an image."""
 
     rounds: tuple[AlignmentRound, ...] = (
-        AlignmentRound(1, 6, 300, 3, 24.0),
-        AlignmentRound(0, 4, 300, 3, 6.0),
-        AlignmentRound(0, 3, 900, 10, 3.0),
+        AlignmentRound(
+            level=1,
+            iterations=6,
+            landmarks=300,
+            steps=3,
+            reach_px=24.0,
+        ),
+        AlignmentRound(
+            level=0,
+            iterations=4,
+            landmarks=300,
+            steps=3,
+            reach_px=6.0,
+        ),
+        AlignmentRound(
+            level=0,
+            iterations=3,
+            landmarks=900,
+            steps=10,
+            reach_px=3.0,
+        ),
     )
     """Rounds from coarse to fine."""
     enough_matched: float = 0.4
@@ -141,7 +158,8 @@ def align_pose(
             if image.prior.other_camera:
                 break  # both cameras fit
             return None  # the intrinsics do not converge
-        pose = refined.pose.pose.rotation_matrix(), refined.pose.pose.translation_m
+        start = refined.pose.pose
+        pose = start.rotation_matrix(), start.translation_m
         change = refined.change
         repeats += 1
         rounds = options.rounds
@@ -158,22 +176,26 @@ def _shift_by_intrinsics_px(camera: Camera, change: Array) -> float:
         return 0.0
     columns = np.linspace(0, camera.width - 1, 5)
     rows = np.linspace(0, camera.height - 1, 5)
-    pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
-    plane = camera.pinhole.unproject(pixels)[:, :2]
-    _, by_intrinsics = camera.slopes(plane)
+    grid = np.meshgrid(columns, rows)
+    pixels = np.stack(grid, -1).reshape(-1, 2)
+    rays = camera.pinhole.unproject(pixels)
+    _, by_intrinsics = camera.slopes(rays[:, :2])
     shifts = np.linalg.norm(by_intrinsics @ change, axis=-1)
-    return float(np.sort(shifts[np.isfinite(shifts)])[-7])
+    shifts = shifts[np.isfinite(shifts)]
+    return float(np.sort(shifts)[-7])
 
 
 def _consistent(observed: Observed, camera: Camera) -> Pose | None:
     """The pose that most of the matches agree with; None if few do."""
-    ideal = camera.pinhole.project(camera.unproject(observed.pixels))
+    rays = camera.unproject(observed.pixels)
+    ideal = camera.pinhole.project(rays)
     valid = np.isfinite(ideal).all(1)
     points = observed.points_m[valid]
     rough = solve_pnp(ideal[valid], points, camera, _LOOSE_PNP)
-    if rough is None or rough.inliers.sum() < _HOPELESS * observed.expected:
+    if rough is None or rough.inlier_count < _HOPELESS * observed.expected:
         return None
-    return rough.pose.rotation_matrix(), rough.pose.translation_m
+    pose = rough.pose
+    return pose.rotation_matrix(), pose.translation_m
 
 
 class _Search:

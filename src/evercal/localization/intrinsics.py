@@ -13,7 +13,7 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.typing import Array
+from evercal.typing import Array, Image
 
 Kind = Literal["own", "not stated", "same model", "stated", "unknown", "free"]
 
@@ -91,19 +91,50 @@ class IntrinsicsPrior:
         return doubt, UNKNOWN.tested(camera, change, measured)
 
 
-OWN = IntrinsicsPrior(2e-4, 3e-4, 1e-3, 1e-3, other_camera=0.4, kind="own")
+OWN = IntrinsicsPrior(
+    focal=2e-4,
+    centre=3e-4,
+    k1=1e-3,
+    k2=1e-3,
+    other_camera=0.4,
+    kind="own",
+)
 """The camera that recorded the scene: its error is in the landmarks, too, and cancels. People also
 state it for other cameras of the model, hence `other_camera`. Where an image shows no difference,
 the covariance includes the pose of another camera."""
 NOT_STATED = replace(OWN, kind="not stated")
 """No camera is stated, and the image has the size of the recording."""
-SAME_MODEL = IntrinsicsPrior(0.007, 0.007, 0.01, 0.01, kind="same model")
+SAME_MODEL = IntrinsicsPrior(
+    focal=0.007,
+    centre=0.007,
+    k1=0.01,
+    k2=0.01,
+    kind="same model",
+)
 """Another camera of the same model and image size."""
-STATED = IntrinsicsPrior(2e-3, 2e-3, 5e-3, 5e-3, kind="stated")
+STATED = IntrinsicsPrior(
+    focal=2e-3,
+    centre=2e-3,
+    k1=5e-3,
+    k2=5e-3,
+    kind="stated",
+)
 """Intrinsics that the user states."""
-UNKNOWN = IntrinsicsPrior(0.3, 0.05, 0.1, 0.05, kind="unknown")
+UNKNOWN = IntrinsicsPrior(
+    focal=0.3,
+    centre=0.05,
+    k1=0.1,
+    k2=0.05,
+    kind="unknown",
+)
 """Any camera; the image may be cropped."""
-FREE = IntrinsicsPrior(1.0, 0.3, 0.3, 0.3, kind="free")
+FREE = IntrinsicsPrior(
+    focal=1.0,
+    centre=0.3,
+    k1=0.3,
+    k2=0.3,
+    kind="free",
+)
 """Wide enough to test the other priors."""
 FOCAL_FACTORS = (0.58, 0.7, 0.84, 1.2, 1.44)
 """Other focal lengths that are tried where none is known, relative to a first guess."""
@@ -134,7 +165,7 @@ class RecordedScene(Protocol):
 
 
 def cameras_in_scenes(
-    camera: Camera | None, image: np.ndarray, scenes: Sequence[RecordedScene]
+    camera: Camera | None, image: Image, scenes: Sequence[RecordedScene]
 ) -> list[Camera]:
     """Intrinsics of an image in each scene; a guess where none are given and no aspect ratio fits.
 
@@ -168,7 +199,7 @@ def _is_own(camera: Camera, scene: RecordedScene) -> bool:
 
 
 def prior_of(
-    camera: Camera | None, image: np.ndarray, scene: RecordedScene
+    camera: Camera | None, image: Image, scene: RecordedScene
 ) -> IntrinsicsPrior:
     """Prior of the intrinsics of an image: stated, the recording's, or unknown."""
     if camera is not None:

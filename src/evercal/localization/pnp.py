@@ -1,6 +1,7 @@
 """Pose from 2D-3D matches: PoseLib's LO-RANSAC with a cap, and the covariance of the pose."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -47,6 +48,11 @@ class PnpResult(NamedTuple):
     inliers: BoolArray
     """(n,)."""
 
+    @property
+    def inlier_count(self) -> int:
+        """Number of matches that agree with the pose."""
+        return int(np.count_nonzero(self.inliers))
+
 
 def solve_pnp(
     pixels: Array, points_m: Array, camera: Camera, options: PnpOptions
@@ -79,6 +85,25 @@ def solve_pnp(
         return None
     camera_from_points = SE3(np.asarray(pose.q, float), np.asarray(pose.t, float))
     return PnpResult(camera_from_points.inverse(), inliers)
+
+
+def most_inliers(
+    pixels: Array,
+    points_m: Array,
+    cameras: Sequence[Camera],
+    options: PnpOptions,
+) -> tuple[int, PnpResult | None]:
+    """Index and pose of the camera with the most inliers, see `solve_pnp`; None without a pose."""
+    best = None
+    index = 0
+    most = 0
+    for number, camera in enumerate(cameras):
+        result = solve_pnp(pixels, points_m, camera, options)
+        if result is not None and result.inlier_count > most:
+            best = result
+            index = number
+            most = result.inlier_count
+    return index, best
 
 
 def uncertain(

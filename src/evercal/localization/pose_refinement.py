@@ -1,8 +1,4 @@
-"""Robust Gauss-Newton refinement of a camera's pose and intrinsics, with their covariance.
-
-`minimise` refines them with a prior of the intrinsics. `self_calibrated` widens that prior where
-the image contradicts it.
-"""
+"""Robust Gauss-Newton refinement of a camera's pose and intrinsics, with their covariance."""
 
 from dataclasses import dataclass, replace
 
@@ -11,12 +7,7 @@ import numpy as np
 
 from evercal.geometry import SE3, Camera, UncertainPose, in_parent_axes
 from evercal.geometry.normal_equations import normal_inverse
-from evercal.localization.intrinsics import (
-    FREE,
-    INTRINSICS,
-    SAME_MODEL,
-    IntrinsicsPrior,
-)
+from evercal.localization.intrinsics import INTRINSICS
 from evercal.typing import Array
 
 Pose = tuple[Array, Array]
@@ -42,13 +33,6 @@ _BENT_PX = 0.01
 intrinsics: a flat wall seen from the front would otherwise seem to measure the focal length."""
 _RIDGE = 1e-12
 """Ridge of the scaled information: an unconstrained direction gets a huge variance."""
-_MAX_ITERATIONS = 10
-"""Gauss-Newton iterations of pose and intrinsics."""
-_ROUGH = 0.7
-"""If the residual variance changes by more than this ratio, the pose is estimated again."""
-_REACHED = 0.05 * 7.815
-"""Probability of another camera above which the covariance includes its pose: at 5 %, its squared
-distance is the 95 % quantile of chi-squared with three degrees of freedom."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,14 +103,16 @@ class Minimum:
         count = 6 + len(prior)
         squares = (self.residual**2).sum(0)
         weight = 1 / (1 + squares / self.variance)
+        squared_weight = weight**2
+        degrees = 2 * squared_weight.sum()
+        noise = float((squared_weight @ squares) / degrees)
         slope = self.slope[:count] * weight
         rows = slope.reshape(count, -1)
-        sums = (slope @ cells).reshape(count, -1)
         hessian = rows @ rows.T
-        squared_weight = weight**2
-        noise = float((squared_weight @ squares) / (2 * squared_weight.sum()))
+        sums = (slope @ cells).reshape(count, -1)
         shared = SHARED * self.variance**2
-        scores = noise * hessian + shared * sums @ sums.T
+        scores = noise * hessian
+        scores += shared * sums @ sums.T
         diagonal = slice(6 * count + 6, None, count + 1)
         hessian.flat[diagonal] += prior
         scores.flat[diagonal] += prior * (self.variance + self.bent)
@@ -136,7 +122,8 @@ class Minimum:
     def after(self, step: Array) -> "Minimum":
         """The same with the residuals after a step (k,), to first order."""
         residual = self.residual + np.tensordot(step, self.slope, 1)
-        variance = robust_variance((residual**2).sum(0))
+        squares = (residual**2).sum(0)
+        variance = robust_variance(squares)
         return replace(self, residual=residual, variance=variance)
 
     def pose(self, covariance: Array) -> UncertainPose:
@@ -158,26 +145,22 @@ def minimise(
 ) -> Minimum:
     """Minimise whitened reprojection errors with Cauchy weights.
 
-    The start is rotation and position of points_from_camera, roughly, with a change (5,) of the
-    intrinsics. These have variances (5,) about those of `camera`; none hold them fixed. Errors are
-    linear in them: the caller repeats it after a large change.
+    `change` (5,) of the intrinsics is that of the start; `variances` (5,) are about `camera`, none
+    hold it fixed. Errors are linear in the change: the caller repeats it after a large one.
     """
     rotation, position = start
     best = None
     gradient = np.zeros(0)
     now = camera.changed(change)
     moved = change.copy()
-    white = observed.whitening
     free = len(variances)
-    bent = _BENT_PX**2 * float((white**2).sum()) / 2
+    bent = _BENT_PX**2 * float((observed.whitening**2).sum()) / 2
     for _ in range(max(iterations, 1)):
         raw, slope = linearise(
             observed.pixels, observed.points_m, rotation, position, now, free > 0
         )
         raw += (moved - change)[:free] @ slope[6:].transpose(1, 0, 2)
-        residual = white[:, 0] * raw[0] + white[:, 1] * raw[1]
-        first = white[None, :, 0] * slope[:, 0, None]
-        slope = first + white[None, :, 1] * slope[:, 1, None]
+        residual, slope = _whitened(observed.whitening, raw, slope)
         squares = residual[0] * residual[0] + residual[1] * residual[1]
         variance = robust_variance(squares)
         if best is not None and variance > _DIVERGED * best.variance:
@@ -201,9 +184,7 @@ def minimise(
         )
         prior = best.against(variances)
         step, _ = best.moved(prior)
-        moved = moved.copy()
-        moved[:free] += step[6:]
-        moved[0] = np.clip(moved[0], -_FOCAL_CHANGE, _FOCAL_CHANGE)
+        moved = _stepped(moved, step[6:])
         position = position + rotation @ step[:3]
         rotation = rotation @ cv2.Rodrigues(step[3:6])[0]
         gradient = gradient + data @ step
@@ -216,6 +197,22 @@ def minimise(
     return _with_camera(ahead)
 
 
+def _stepped(change: Array, step: Array) -> Array:
+    """The change (5,) of the intrinsics after a step, with a bounded focal length."""
+    stepped = change.copy()
+    stepped[: len(step)] += step
+    stepped[0] = np.clip(stepped[0], -_FOCAL_CHANGE, _FOCAL_CHANGE)
+    return stepped
+
+
+def _whitened(white: Array, errors: Array, slope: Array) -> tuple[Array, Array]:
+    """Errors (2, n) and their derivatives (k, 2, n), whitened by (2, 2, n)."""
+    residual = white[:, 0] * errors[0] + white[:, 1] * errors[1]
+    by_x = white[None, :, 0] * slope[:, 0, None]
+    by_y = white[None, :, 1] * slope[:, 1, None]
+    return residual, by_x + by_y
+
+
 def _with_camera(minimum: Minimum) -> Minimum:
     """The minimum with its change applied to the camera."""
     if not minimum.change.any():
@@ -223,106 +220,13 @@ def _with_camera(minimum: Minimum) -> Minimum:
     return replace(minimum, camera=minimum.camera.changed(minimum.change))
 
 
-@dataclass(frozen=True, eq=False)
-class RefinedPose:
-    """A pose, intrinsics and the residuals of the observations."""
-
-    pose: UncertainPose
-    """points_from_camera; the uncertainty of the intrinsics is part of its covariance."""
-    observed: Observed
-    """Landmarks that the pose was refined by."""
-    residual_px: Array
-    """(n,) reprojection errors, pixels of the image."""
-    camera: Camera
-    """Refined intrinsics."""
-    change: Array
-    """(5,) change of the intrinsics."""
-    by_intrinsics: Array
-    """(6, 6) share of the pose's covariance that is due to the intrinsics."""
-
-
-def self_calibrated(
-    observed: Observed,
-    camera: Camera,
-    start: Pose,
-    change: Array,
-    prior: IntrinsicsPrior,
-) -> RefinedPose:
-    """Pose and intrinsics; the prior gives way where the image contradicts it.
-
-    The start is that of `minimise`. Other priors than the stated one are a linear step away, unless
-    the image contradicts it.
-    """
-    stated = prior.variances(camera)
-    free = FREE.variances(camera)
-    best = minimise(observed, camera, start, _MAX_ITERATIONS, stated, change)
-    cells = cells_of(observed.pixels, camera)
-    step, _ = best.moved(best.against(free))
-    relaxed = best.after(step)
-    measured = _measured(relaxed, free, cells)
-    doubt, variances = prior.decided(camera, best.change + step[6:], measured)
-    rough = not _ROUGH < relaxed.variance / best.variance < 1 / _ROUGH
-    if variances is not None or doubt > prior.other_camera or rough:
-        start = best.rotation, best.position
-        freed = minimise(observed, camera, start, _MAX_ITERATIONS, free, best.change)
-        if freed.variance < relaxed.variance:
-            measured = _measured(freed, free, cells)
-            doubt, variances = prior.decided(camera, freed.change, measured)
-        if variances is not None:
-            start = freed.rotation, freed.position
-            best = minimise(
-                observed, camera, start, _MAX_ITERATIONS, variances, freed.change
-            )
-    if variances is not None:
-        covariance, lens = _covariances(best, variances, cells)
-    else:
-        covariance, lens = _covariances(best, stated, cells)
-        if doubt:
-            wider = _reaching_other_camera(best, stated, lens, cells)
-            more = min(1.0, doubt / _REACHED) * wider
-            covariance = covariance + more
-            lens = lens + more
-    more = best.bent / best.variance * lens
-    by_lens = in_parent_axes(best.rotation, lens + more)
-    pose = best.pose(covariance + more)
-    return RefinedPose(
-        pose, observed, best.residual_px, best.camera, best.change, by_lens
-    )
-
-
-def _reaching_other_camera(
-    minimum: Minimum, stated: Array, lens: Array, cells: Array
-) -> Array:
-    """(6, 6) covariance whose deviation reaches to the pose of another camera of the model."""
-    other = SAME_MODEL.variances(minimum.camera)
-    to_other, _ = minimum.moved(minimum.against(other))
-    to_stated, _ = minimum.moved(minimum.against(stated))
-    offset = (to_other - to_stated)[:6]
-    return _covariances(minimum, other, cells)[1] - lens + np.outer(offset, offset)
-
-
-def _measured(minimum: Minimum, free: Array, cells: Array) -> Array:
-    """(5, 5) covariance of intrinsics without a prior."""
-    formal = minimum.covariance(minimum.against(free), cells)[6:, 6:]
-    return (1 + minimum.bent / minimum.variance) * formal
-
-
-def _covariances(
-    minimum: Minimum, variances: Array, cells: Array
-) -> tuple[Array, Array]:
-    """(6, 6) covariance of a pose in camera axes, and the share of the intrinsics in it."""
-    whole = minimum.covariance(minimum.against(variances), cells)[:6, :6]
-    share = whole - minimum.covariance(np.zeros(0), cells)
-    values, axes = np.linalg.eigh(share)
-    return whole, (axes * np.maximum(values, 0)) @ axes.T
-
-
 def robust_variance(squares: Array) -> float:
     """Variance of 2-D errors from their squared norms (n,), at least 0.05."""
     # The median of a 2-D Gaussian's squared norm is 1.386 variances.
     half = len(squares) // 2
     # np.median takes three times as long for some hundred values.
-    return max(float(np.partition(squares, half)[half]) / 1.386, 0.05)
+    median = float(np.partition(squares, half)[half])
+    return max(median / 1.386, 0.05)
 
 
 def cells_of(pixels: Array, camera: Camera) -> Array:
@@ -346,10 +250,10 @@ def linearise(
     (6 or 11, 2, n) by a motion (translation, rotation) in the camera frame and by a change of the
     intrinsics.
     """
-    local = rotation.T @ (points_m - position).T
-    inverse = 1 / np.maximum(local[2], 1e-3)
-    x = local[0] * inverse
-    y = local[1] * inverse
+    x, y, depth = rotation.T @ (points_m - position).T
+    inverse = 1 / np.maximum(depth, 1e-3)
+    x = x * inverse
+    y = y * inverse
     slope = np.zeros((6 + INTRINSICS * intrinsics, 2, len(x)))
     slope[0, 0] = -inverse
     slope[2, 0] = x * inverse
@@ -365,10 +269,9 @@ def linearise(
         # Written out: products of small matrices take four times as long.
         by_plane, lens = camera.slopes(np.stack([x, y], -1))
         chain = np.ascontiguousarray(by_plane.transpose(1, 2, 0))
-        slope[:6] = (
-            chain[None, :, 0] * slope[:6, 0, None]
-            + chain[None, :, 1] * slope[:6, 1, None]
-        )
+        by_x = chain[None, :, 0] * slope[:6, 0, None]
+        by_y = chain[None, :, 1] * slope[:6, 1, None]
+        slope[:6] = by_x + by_y
         if intrinsics:
             slope[6:] = lens.transpose(2, 1, 0)
         # The derivative by the logarithm of the focal length is the pixel beside the centre.
@@ -386,4 +289,6 @@ def linearise(
             slope[8, 1] = 1
             slope[9] = slope[6] * r2
             slope[10] = slope[9] * r2
-    return np.stack([u + camera.cx - pixels[:, 0], v + camera.cy - pixels[:, 1]]), slope
+    u = u + camera.cx - pixels[:, 0]
+    v = v + camera.cy - pixels[:, 1]
+    return np.stack([u, v]), slope

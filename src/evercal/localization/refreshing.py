@@ -94,10 +94,7 @@ def refresh_scene(
     began = time.perf_counter()
     options = options or RefreshOptions()
     cameras = cameras or [None] * len(images)
-    estimates = []
-    for (_, image), camera in zip(images, cameras, strict=True):
-        estimates.append(localize_picture(localizer, image, camera))
-        on_progress("locating", len(estimates), len(images))
+    estimates = _estimates(localizer, images, cameras, on_progress)
     contents = localizer.contents
     index = _shown_scene(localizer, estimates)
     scene = contents.scenes[index]
@@ -142,6 +139,19 @@ def refresh_scene(
     return updated, report
 
 
+def _estimates(
+    localizer: Localizer,
+    images: Sequence[tuple[str, Picture]],
+    cameras: Sequence[Camera | None],
+    on_progress: OnProgress,
+) -> list[PoseEstimate]:
+    estimates = []
+    for (_, image), camera in zip(images, cameras, strict=True):
+        estimates.append(localize_picture(localizer, image, camera))
+        on_progress("locating", len(estimates), len(images))
+    return estimates
+
+
 def _shown_scene(localizer: Localizer, estimates: Sequence[PoseEstimate]) -> int:
     """Index of the scene that most of the images show; the last one without any."""
     names = [e.scene for e in estimates if e.status == "ok" and e.scene is not None]
@@ -181,7 +191,8 @@ def _precise(estimate: PoseEstimate, scene: SceneMap) -> bool:
     for term in estimate.terms:
         if term.name in ("view", "lens"):
             covariance = covariance + term.covariance
-    sigma = np.sqrt(np.diag(covariance).reshape(2, 3).mean(1))
+    variance = np.diag(covariance).reshape(2, 3)
+    sigma = np.sqrt(variance.mean(1))
     metres = scene.at_room_scale(sigma[0])
     return bool(sigma[1] < PRECISE_RAD and metres < PRECISE_M)
 
@@ -215,8 +226,10 @@ def _verified(after: Localizer, images: Sequence[NewImage], scene: str) -> _Shif
     mean = average_poses(poses)
     tangent = mean.log()
     scatter = (mean.inverse() @ poses).log().reshape(-1, 2, 3)
-    of_mean = np.sqrt((scatter**2).mean((0, 2)) / max(len(moves) - 1, 1))
-    size = np.sqrt((tangent.reshape(2, 3) ** 2).mean(1))
+    variance = (scatter**2).mean((0, 2))
+    of_mean = np.sqrt(variance / max(len(moves) - 1, 1))
+    squares = tangent.reshape(2, 3) ** 2
+    size = np.sqrt(squares.mean(1))
     return _Shift(tangent, np.maximum(of_mean, size), len(moves))
 
 

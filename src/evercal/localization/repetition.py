@@ -42,10 +42,13 @@ def pattern_steps(points_m: Array, templates: Array, position_m: Array) -> Array
     sampled = np.linspace(0, len(points_m) - 1, count).astype(int)
     points = points_m[sampled]
     patches = templates[sampled]
-    distance = float(np.median(np.linalg.norm(points - position_m, axis=1)))
-    first, second = np.nonzero(patches @ patches.T > ALIKE * patches.shape[1])
+    distances = np.linalg.norm(points - position_m, axis=1)
+    distance = float(np.median(distances))
+    correlation = patches @ patches.T
+    first, second = np.nonzero(correlation > ALIKE * patches.shape[1])
     moves = points[second] - points[first]
-    moves = moves[np.linalg.norm(moves, axis=1) > LEAST_STEP * distance]
+    lengths = np.linalg.norm(moves, axis=1)
+    moves = moves[lengths > LEAST_STEP * distance]
     if not len(moves):
         return np.zeros((0, 3))
     least = max(LEAST_PAIRS, LEAST_SHARE * count)

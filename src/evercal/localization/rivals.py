@@ -7,7 +7,7 @@ from evercal.localization.acceptance import FULL_SUPPORT
 from evercal.localization.answer import differ
 from evercal.localization.hypothesis import Aligned, accepted
 from evercal.localization.intrinsics import FOCAL_FACTORS, zoomed
-from evercal.localization.pnp import solve_pnp
+from evercal.localization.pnp import most_inliers
 from evercal.localization.query import Query
 from evercal.localization.repetition import displaced
 from evercal.localization.scene_poses import ScenePoses
@@ -114,19 +114,15 @@ def _other_focal_lengths(
     camera = query.cameras[best.scene].short_side_resized(poses.contents.short_side)
     # As many inliers are sought as at the focal length of the pose.
     options = replace(poses.options.pnp, sought_inliers=best.pnp_inliers)
-    most = 0
-    start = best.pose.pose
-    change = best.change
+    factors = []
     for factor in (1.0, *FOCAL_FACTORS):
-        other = zoomed(factor)
-        if abs(other[0] - best.change[0]) <= _NEXT_FOCAL:
-            continue
-        pnp = solve_pnp(*best.matches, camera.zoomed(factor), options)
-        if pnp is not None and pnp.inliers.sum() > most:
-            most = int(pnp.inliers.sum())
-            start = pnp.pose
-            change = other
-    if most >= best.pnp_inliers:
-        rival = poses.aligned(query, best.candidate, start, change)
-        if rival is not None:
-            yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)
+        if abs(zoomed(factor)[0] - best.change[0]) > _NEXT_FOCAL:
+            factors.append(factor)
+    cameras = [camera.zoomed(factor) for factor in factors]
+    index, pnp = most_inliers(*best.matches, cameras, options)
+    if pnp is None or pnp.inlier_count < best.pnp_inliers:
+        return
+    change = zoomed(factors[index])
+    rival = poses.aligned(query, best.candidate, pnp.pose, change)
+    if rival is not None:
+        yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)

@@ -15,7 +15,7 @@ from evercal.localization.intrinsics import FOCAL_FACTORS, IntrinsicsPrior, zoom
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.matching import Matcher
 from evercal.localization.options import LocalizeOptions
-from evercal.localization.pnp import PnpResult, solve_pnp, uncertain
+from evercal.localization.pnp import PnpResult, most_inliers, solve_pnp, uncertain
 from evercal.localization.query import Candidate, Query
 from evercal.mapping.scene_map import MapContents
 from evercal.typing import Array
@@ -44,7 +44,7 @@ class ScenePoses:
         if solution is None:
             return None
         pnp, factor = solution
-        count = int(pnp.inliers.sum())
+        count = pnp.inlier_count
         if not self.options.align:
             pixels = matches.pixels[pnp.inliers]
             points = matches.points_m[pnp.inliers]
@@ -67,21 +67,21 @@ class ScenePoses:
         unknown = prior.kind == "unknown"
         options = replace(self.options.pnp, progressive_sampling=not unknown)
         best = solve_pnp(*matches, camera, options)
-        most = 0 if best is None else int(best.inliers.sum())
-        best_factor = 1.0
-        many = most >= self.options.aligned_inliers
+        factor = 1.0
+        many = best is not None and best.inlier_count >= self.options.aligned_inliers
         if unknown or (many and self._may_be_zoomed(prior, candidate)):
             half = options.max_iterations // 2
             options = replace(options, max_iterations=half)
-            for factor in FOCAL_FACTORS:
-                pnp = solve_pnp(*matches, camera.zoomed(factor), options)
-                if pnp is not None and pnp.inliers.sum() > most:
-                    best = pnp
-                    best_factor = factor
-                    most = int(pnp.inliers.sum())
+            cameras = [camera.zoomed(factor) for factor in FOCAL_FACTORS]
+            index, other = most_inliers(*matches, cameras, options)
+            if best is None or (
+                other is not None and other.inlier_count > best.inlier_count
+            ):
+                best = other
+                factor = FOCAL_FACTORS[index]
         if best is None:
             return None
-        return best, best_factor
+        return best, factor
 
     def _may_be_zoomed(self, prior: IntrinsicsPrior, candidate: Candidate) -> bool:
         """Whether a pose of many inliers that is not final may be due to another focal length.

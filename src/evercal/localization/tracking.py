@@ -283,7 +283,8 @@ class Tracker:
         if last_stamp <= first_stamp:
             return pose
         share = (stamp - last_stamp) / (last_stamp - first_stamp)
-        return pose @ SE3.exp(share * (first.inverse() @ pose).log())
+        step = (first.inverse() @ pose).log()
+        return pose @ SE3.exp(share * step)
 
     def _next_keyframes(self, pose: SE3) -> IntArray:
         """Keyframes in the bank next to a pose, in metres and radians."""
@@ -324,7 +325,9 @@ class Tracker:
         smoothed = pose.pose
         jumped = pose.squared_mahalanobis(before) > 6 * self.options.jump_sigmas**2
         if not jumped:
-            gain = 1 - np.exp(-max(stamp - last_stamp, 0.0) / self.options.smooth)
-            smoothed = before @ SE3.exp(gain * (before.inverse() @ pose.pose).log())
+            elapsed = max(stamp - last_stamp, 0.0)
+            gain = 1 - np.exp(-elapsed / self.options.smooth)
+            step = (before.inverse() @ pose.pose).log()
+            smoothed = before @ SE3.exp(gain * step)
         self._smoothed = (stamp, smoothed)
         return smoothed, bool(jumped)
