@@ -247,7 +247,13 @@ def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:
         for rotvec, translation in zip(rotvecs, translations, strict=True):
             if np.isfinite([rotvec, translation]).all() and translation[2] > 0:
                 rotation = Rotation.from_rotvec(np.ravel(rotvec))
-                poses.append(SE3.of(rotation, np.ravel(translation), canonical=False))
+                poses.append(
+                    SE3.of(
+                        rotation,
+                        np.ravel(translation),
+                        canonical=False,
+                    )
+                )
     return poses
 
 

@@ -112,10 +112,13 @@ def _settled(
 
 
 def _find_chessboard(grey: Image, board: Board) -> Detection:
-    y, x = np.indices((board.rows, board.columns), dtype=np.float64)
-    points = board.size_m * np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
-    for pixels in _chessboard_candidates(grey, (board.columns, board.rows)):
-        view = sharpened(grey, BoardView(points, pixels), board)
+    size = (board.columns, board.rows)
+    y, x = np.indices(size[::-1], dtype=np.float64)
+    squares = np.stack([x, y, np.zeros_like(x)], -1)
+    points = board.size_m * squares.reshape(-1, 3)
+    for pixels in _chessboard_candidates(grey, size):
+        view = BoardView(points, pixels)
+        view = sharpened(grey, view, board)
         grid = view.pixels.reshape(board.rows, board.columns, 2)
         if not _is_even(grid):
             continue
@@ -137,7 +140,13 @@ def _chessboard_candidates(grey: Image, size: tuple[int, int]) -> Iterator[Array
         searches.append((cv2.findChessboardCornersSB, 2, normalized))
     cubic = cv2.INTER_CUBIC
     for find, scale, flags in searches:
-        image = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cubic)
+        image = cv2.resize(
+            grey,
+            None,
+            fx=scale,
+            fy=scale,
+            interpolation=cubic,
+        )
         detected, pixels = find(image, size, flags=flags)
         if detected:
             yield resize_pixels(pixels.reshape(-1, 2).astype(np.float64), 1 / scale)
@@ -191,11 +200,17 @@ def _with_border(grid: Array) -> Array:
 
 def _first_square_is_bright(grey: Image, grid: Array) -> bool:
     """Whether the first inner square, and every second one, is brighter than the others."""
-    middle = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
+    rows = grid[:-1] + grid[1:]
+    middle = rows[:, :-1] + grid[:-1, 1:] + grid[1:, 1:]
+    middle = middle / 4
     smooth = cv2.boxFilter(grey, -1, (3, 3))
     height, width = grey.shape
-    x, y = np.round(middle).astype(int).transpose(2, 0, 1)
-    values = smooth[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+    x, y = np.moveaxis(np.round(middle).astype(int), 2, 0)
+    x = np.clip(x, 0, width - 1)
+    y = np.clip(y, 0, height - 1)
+    values = smooth[y, x]
     row, column = np.indices(values.shape)
     even = (row + column) % 2 == 0
-    return float(values[even].mean()) > float(values[~even].mean())
+    bright = values[even].mean()
+    dark = values[~even].mean()
+    return float(bright) > float(dark)

@@ -94,7 +94,13 @@ def _in_windows(
         rows = half == size
         corners = start[rows, None].copy()
         window = (size, size)
-        corners = cv2.cornerSubPix(grey, corners, window, (-1, -1), criteria)
+        corners = cv2.cornerSubPix(
+            grey,
+            corners,
+            window,
+            (-1, -1),
+            criteria,
+        )
         refined[rows] = corners[:, 0]
     lost = np.linalg.norm(refined - start, axis=1) > half
     refined[lost] = start[lost]
@@ -106,15 +112,18 @@ def _steps(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
 
     Each corner has a quadratic map by its neighbours, so that any lens will do.
     """
-    distances = np.linalg.norm(points[:, None] - points, axis=2)
+    differences = points[:, None] - points
+    distances = np.linalg.norm(differences, axis=2)
     near = np.argsort(distances, 1)[:, 1 : _NEIGHBOURS + 1]
     x, y = np.moveaxis(points[near] - points[:, None], 2, 0)
+    moved = pixels[near] - pixels[:, None]
     terms = np.stack([x, y, x * x, x * y, y * y], -1)
-    slopes = np.linalg.pinv(terms) @ (pixels[near] - pixels[:, None])
+    slopes = np.linalg.pinv(terms) @ moved
     along = slopes[:, 0]
     down = slopes[:, 1]
-    area = np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
-    return along, down, area
+    area = along[:, 0] * down[:, 1]
+    area = area - along[:, 1] * down[:, 0]
+    return along, down, np.abs(area)
 
 
 def squares_by_their_sides(grey: Image, squares: Array) -> Array:
@@ -126,7 +135,14 @@ def squares_by_their_sides(grey: Image, squares: Array) -> Array:
     refined = squares
     for share, most_px, end in _TAG_ROUNDS:
         corners = refined.reshape(-1, 2)
-        sides = (np.roll(refined, -1, axis=1) - refined).reshape(-1, 2)
+        sides = (
+            np.roll(
+                refined,
+                -1,
+                axis=1,
+            )
+            - refined
+        ).reshape(-1, 2)
         reach = np.clip(share * np.linalg.norm(sides, axis=1), 2.0, most_px)
         starts = corners + end * sides
         ends = corners + (1 - end) * sides
@@ -168,7 +184,14 @@ def _edges(
     points = starts[:, None] + np.linspace(0, 1, count)[:, None] * sides[:, None]
     grid = points[:, :, None] + offsets[..., None] * across[:, None]
     x, y = grid.reshape(len(starts), -1, 2).astype(np.float32).transpose(2, 0, 1)
-    values = cv2.remap(grey, x, y, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+    values = cv2.remap(
+        grey,
+        x,
+        y,
+        cv2.INTER_LINEAR,
+        None,
+        cv2.BORDER_REPLICATE,
+    )
     values = np.asarray(values, dtype=np.float64).reshape(grid.shape[:3])
     slope = np.gradient(values, axis=2)
     if outwards:
@@ -193,7 +216,11 @@ def _tangents(points: Array, corners: Array) -> Array:
     deviations = away - away.mean(1, keepdims=True)
     spread = np.einsum("nki,nkj->nij", deviations, deviations)
     _, axes = np.linalg.eigh(spread)
-    across, along = np.moveaxis(away @ axes, 2, 0)
+    across, along = np.moveaxis(
+        away @ axes,
+        2,
+        0,
+    )
     unit = np.maximum(np.abs(along).max(1), 1e-9)[:, None]
     powers = (along / unit)[..., None] ** np.arange(3)
     lowest = np.inf

@@ -91,10 +91,14 @@ class LensPrior(NamedTuple):
         mean = np.zeros(len(lens_vector(camera)))
         mean[:2] = camera.fx
         mean[2:4] = _middle(camera.width, camera.height)
+        centre_px = _CENTRE_SIGMA * camera.width
         distortion = _DISTORTION_SIGMA[camera.model]
-        prior = cls._around(mean, _CENTRE_SIGMA * camera.width, distortion)
-        aspect = np.array([[1.0, -1.0], [-1.0, 1.0]]) / (_ASPECT_SIGMA * camera.fx) ** 2
-        prior.information[:2, :2] = aspect + np.eye(2) / (_FOCAL_SIGMA * camera.fx) ** 2
+        prior = cls._around(mean, centre_px, distortion)
+        aspect_px = _ASPECT_SIGMA * camera.fx
+        focal_px = _FOCAL_SIGMA * camera.fx
+        difference = np.array([[1.0, -1.0], [-1.0, 1.0]])
+        focal = difference / aspect_px**2 + np.eye(2) / focal_px**2
+        prior.information[:2, :2] = focal
         return prior
 
     @classmethod

@@ -103,14 +103,19 @@ class MarkerLayout(NamedTuple):
 
     def fit(self, markers: Markers) -> tuple[BoolArray, float]:
         """Return (m,) which steps fit the layout, and the side of a marker in cells."""
-        steps = self.cells(markers.end) - self.cells(markers.start)
+        start = self.cells(markers.start)
+        steps = self.cells(markers.end) - start
         if len(steps) == 0:
             return np.zeros(0, dtype=bool), 0.0
         lengths = np.abs(steps)
-        side = float(np.median(lengths / np.abs(markers.steps)))
-        errors = np.abs(side * self.on_board(markers.steps) - steps)
-        on_board = self.has(markers.start) & self.has(markers.end)
-        return on_board & (errors < _STEP_ERROR * lengths), side
+        measured = np.abs(markers.steps)
+        side = float(np.median(lengths / measured))
+        predicted = side * self.on_board(markers.steps)
+        errors = np.abs(predicted - steps)
+        on_board = self.has(markers.start)
+        on_board &= self.has(markers.end)
+        fits = errors < _STEP_ERROR * lengths
+        return on_board & fits, side
 
 
 def find_markers(grey: Image, board: Board) -> Markers:
@@ -173,7 +178,11 @@ def _steps(ids: IntArray, corners: Array) -> tuple[IntArray, IntArray, Plane]:
     """Return start, end and vectors of the steps to the nearest markers, see `Markers`."""
     n = len(ids)
     near = min(_NEAREST, max(n - 1, 0))
-    homogeneous = np.pad(corners, ((0, 0), (0, 0), (0, 1)), constant_values=1)
+    homogeneous = np.pad(
+        corners,
+        ((0, 0), (0, 0), (0, 1)),
+        constant_values=1,
+    )
     a, b, c, d = homogeneous.transpose(1, 0, 2)
     centres = np.cross(np.cross(a, c), np.cross(b, d))
     centres = centres / centres[:, 2:]
@@ -184,7 +193,11 @@ def _steps(ids: IntArray, corners: Array) -> tuple[IntArray, IntArray, Plane]:
     homographies = np.zeros((n, 3, 3))
     for k, square in enumerate(corners.astype(np.float32)):
         homographies[k] = cv2.getPerspectiveTransform(square, unit_square)
-    x, y, depth = np.einsum("nij,nj->in", homographies[start], centres[end])
+    x, y, depth = np.einsum(
+        "nij,nj->in",
+        homographies[start],
+        centres[end],
+    )
     return ids[start], ids[end], (x + 1j * y) / depth
 
 

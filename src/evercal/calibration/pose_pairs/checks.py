@@ -142,7 +142,15 @@ def require_rotations(
 
     The angles are root mean squares between two poses, about the main and the second axis.
     """
-    rows = np.linspace(0, len(base_from_gripper) - 1, 100).round().astype(int)
+    rows = (
+        np.linspace(
+            0,
+            len(base_from_gripper) - 1,
+            100,
+        )
+        .round()
+        .astype(int)
+    )
     grippers = base_from_gripper[np.unique(rows)]
     i, j = np.triu_indices(len(grippers), 1)
     motions = grippers[i].inverse() @ grippers[j]

@@ -223,9 +223,25 @@ def _level_uncertainty(
     own = np.einsum("anij,bnji->ab", turned, turned)
     sides = spreads @ weighted
     terms = "anip,nij,bnjq,pq->ab"
-    shared = np.einsum(terms, sides, weight, sides, inverse, optimize=True)
+    shared = np.einsum(
+        terms,
+        sides,
+        weight,
+        sides,
+        inverse,
+        optimize=True,
+    )
     terms = "nip,anij,njq->apq"
-    grams = np.einsum(terms, weighted, spreads, weighted, optimize=True) @ inverse
+    grams = (
+        np.einsum(
+            terms,
+            weighted,
+            spreads,
+            weighted,
+            optimize=True,
+        )
+        @ inverse
+    )
     gram = own - 2 * shared + np.einsum("apq,bqp->ab", grams, grams)
     return 2.0 * normal_inverse(gram, 1e-9)
 
@@ -343,7 +359,9 @@ def _distances(
 ) -> Array:
     # Used poses have moved the estimate towards themselves. Alone, one has no spread on some axis.
     sign = np.where(use, -1.0, 1.0)[:, None, None]
-    explained = system.jacobian @ covariance @ system.jacobian.transpose(0, 2, 1)
+    transposed = system.jacobian.transpose(0, 2, 1)
+    explained = system.jacobian @ covariance @ transposed
     spread = (1 + 1e-3) * noise + sign * explained
-    whitened = np.linalg.solve(spread, system.residual[..., None])[..., 0]
+    residual = system.residual[..., None]
+    whitened = np.linalg.solve(spread, residual)[..., 0]
     return (system.residual * whitened).sum(1)

@@ -196,17 +196,23 @@ def _better(other: Agreement, fit: Agreement) -> bool:
 
 def _plausibility(reading: Reading, fit: Agreement) -> float:
     """Logarithm of the likelihood of the distances and of the directions to the board."""
-    lengths = np.linalg.norm(fit.at.translations, axis=1)
     usual = np.array([_FAR_FROM_BASE_M, _NEAR_M])
     if mount_named(reading.mount).moves:
         usual = usual[::-1]
-    deviations = np.log(np.maximum(lengths, 0.03) / usual) / _SPREAD
+    lengths = np.linalg.norm(fit.at.translations, axis=1)
+    lengths = np.maximum(lengths, 0.03)
+    deviations = np.log(lengths / usual) / _SPREAD
     board = reading.pairs.camera_from_board.translation_m
-    cosine = board[:, 2] / np.linalg.norm(board, axis=1).clip(1e-9)
+    distance = np.linalg.norm(board, axis=1).clip(1e-9)
+    cosine = board[:, 2] / distance
     angle = np.arccos(np.clip(cosine, -1, 1))
-    bell = np.exp(-0.5 * (angle / _FIELD_RAD) ** 2) / (_FIELD_RAD * np.sqrt(np.pi / 2))
-    directions = np.log((1 - _ANYWHERE) * bell + _ANYWHERE / np.pi)
-    return float(_IMAGES * directions.mean() - 0.5 * (deviations**2).sum())
+    # Half of a normal distribution, mixed with any angle from 0 to pi.
+    bell = np.exp(-0.5 * (angle / _FIELD_RAD) ** 2)
+    bell = bell / (_FIELD_RAD * np.sqrt(np.pi / 2))
+    density = (1 - _ANYWHERE) * bell + _ANYWHERE / np.pi
+    of_directions = _IMAGES * np.log(density).mean()
+    of_distances = -0.5 * (deviations**2).sum()
+    return float(of_directions + of_distances)
 
 
 def _require_unit(

@@ -180,7 +180,11 @@ def _inverse_velocity(base_from_gripper: SE3, velocity: Array) -> Array:
 
 def _canonical(pose: SE3) -> Array:
     quaternion = pose.rotation_wxyz
-    largest = np.take_along_axis(quaternion, np.abs(quaternion).argmax(-1)[:, None], -1)
+    largest = np.take_along_axis(
+        quaternion,
+        np.abs(quaternion).argmax(-1)[:, None],
+        -1,
+    )
     return quaternion * np.where(largest < 0, -1.0, 1.0)
 
 

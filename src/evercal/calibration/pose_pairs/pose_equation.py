@@ -175,7 +175,8 @@ class PoseEquation:
         fixed_from_camera = self.robot_rotation @ at.rotations[0]
         # From the origin of the parent to the board.
         lever = (fixed_from_camera @ board[..., None])[..., 0]
-        lever = lever + self.robot_rotation @ at.translations[0]
+        from_parent = self.robot_rotation @ at.translations[0]
+        lever = lever + from_parent
         difference = fixed_from_camera @ turned @ at.rotations[1].T
         rotation = Rotation.from_matrix(difference, assume_valid=True).as_rotvec()
         shift = lever + self.robot_translation - at.translations[1]

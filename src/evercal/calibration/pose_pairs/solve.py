@@ -1,5 +1,6 @@
 """`solve`: estimate a calibration with uncertainty, checks and verdict from pose pairs."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from evercal.calibration.pose_pairs.checks import (
     with_tested_size,
 )
 from evercal.calibration.pose_pairs.fit import (
+    Agreement,
     HandEyeFit,
     agreement,
     least_sigma,
@@ -98,29 +100,12 @@ def solve_pose_pairs(
     rows, first = pairs.distinct(scale_known)
     start, scale = quick_fit(pairs[rows], mount, scale_known)
     own_camera = corners is not None or not of_board
-    require_agreement(
-        pairs[np.sort(rows)],
-        mount,
-        scale_known,
-        start,
-        own_camera,
-    )
+    in_order = pairs[np.sort(rows)]
+    require_agreement(in_order, mount, scale_known, start, own_camera)
     lens = None
     if corners is not None:
-        lens = measured(corners, corners.camera, pairs.camera_from_board)
-        corners = corners.without_strays(pairs.names, lens.poses)
-        lens = measured(corners, corners.camera, pairs.camera_from_board)
-        pairs = lens.applied_to(pairs)
-        start, scale = quick_fit(pairs[rows], mount, scale_known)
-        predicted = _predicted(
-            pairs[rows],
-            mount,
-            start.at,
-            scale,
-        )
-        outliers = ~start.inliers
-        corners, poses = _other_board_poses(corners, lens, rows, outliers, predicted)
-        lens = measured(corners, corners.camera, poses)
+        refined = _by_corners(pairs, rows, mount, scale_known, corners)
+        pairs, corners, lens, start, scale = refined
     problem = _Problem(mount, scale, scale_known, corners, of_board)
     equation, fit, lens = problem.fitted(pairs, rows, start.at, lens)
     warnings: list[str] = []
@@ -131,22 +116,12 @@ def solve_pose_pairs(
     slip = find_slip(equation, fit, rows)
     if slip is not None:
         fit = replace(fit, covariance=fit.covariance + slip.spread)
-        warnings.append(
-            _slip_warning(
-                slip,
-                pairs.names[slip.row],
-                of_board,
-            )
-        )
+        warnings.append(_slip_warning(slip, pairs.names, of_board))
     warnings += _lens_warnings(fit, equation, corners, lens)
     if of_board:
         warnings += _mount_warnings(fit.at, mount)
-    _require_determined(
-        pairs[rows[fit.inliers]],
-        fit,
-        equation,
-        scale_known,
-    )
+    used = pairs[rows[fit.inliers]]
+    _require_determined(used, fit, equation, scale_known)
     return PairSolution(
         pairs=pairs,
         rows=rows,
@@ -159,6 +134,35 @@ def solve_pose_pairs(
         corners=corners,
         lens=lens,
     )
+
+
+def _by_corners(
+    pairs: PosePairs,
+    rows: IntArray,
+    mount: MountName,
+    scale_known: bool,
+    corners: BoardCorners,
+) -> tuple[PosePairs, BoardCorners, Measured, Agreement, float]:
+    """Fit the board poses to the corners without strays, those of outliers by the other pairs.
+
+    Returns:
+        Pairs with these poses, corners, board poses, and the agreement and scale of the pairs.
+    """
+    lens = measured(corners, corners.camera, pairs.camera_from_board)
+    corners = corners.without_strays(pairs.names, lens.poses)
+    lens = measured(corners, corners.camera, pairs.camera_from_board)
+    pairs = lens.applied_to(pairs)
+    start, scale = quick_fit(pairs[rows], mount, scale_known)
+    predicted = _predicted(
+        pairs[rows],
+        mount,
+        start.at,
+        scale,
+    )
+    outliers = ~start.inliers
+    corners, poses = _other_board_poses(corners, lens, rows, outliers, predicted)
+    lens = measured(corners, corners.camera, poses)
+    return pairs, corners, lens, start, scale
 
 
 def _predicted(
@@ -174,17 +178,13 @@ def _predicted(
     return SE3(predicted.rotation_wxyz, predicted.translation_m / scale)
 
 
-def _slip_warning(
-    slip: Slip,
-    name: str,
-    of_board: bool,
-) -> str:
+def _slip_warning(slip: Slip, names: Sequence[str], of_board: bool) -> str:
     what = slip.what
     if not of_board:
         what = what.replace("board", "map")
     return (
         f"the {what} looks moved by {1000 * slip.metres:.1f} mm and"
-        f" {np.rad2deg(slip.radians):.2f} deg before {name}, or the arm"
+        f" {np.rad2deg(slip.radians):.2f} deg before {names[slip.row]}, or the arm"
         " drifts: calibrate from the poses before or after it, or fasten it and record again"
     )
 

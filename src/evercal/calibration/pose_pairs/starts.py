@@ -49,7 +49,15 @@ class Start(NamedTuple):
 def consensus_start(equation: PoseEquation, scale_known: bool = True) -> Start:
     """Return the hypothesis that agrees best with the better half of three or more poses."""
     n = len(equation)
-    rows = np.linspace(0, n - 1, _MAX_SCORED).round().astype(int)
+    rows = (
+        np.linspace(
+            0,
+            n - 1,
+            _MAX_SCORED,
+        )
+        .round()
+        .astype(int)
+    )
     scored = equation[np.unique(rows)]
     a, b, c = _triples(n).T
     first = np.stack([a, a, b], 1)
@@ -149,7 +157,11 @@ def _least_squares(system: Array, right_side: Array) -> Array:
 
 
 def _sine_axes(rotations: Array) -> Array:
-    skew = rotations - np.swapaxes(rotations, -1, -2)
+    skew = rotations - np.swapaxes(
+        rotations,
+        -1,
+        -2,
+    )
     return np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
 
 

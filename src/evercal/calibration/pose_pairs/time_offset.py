@@ -145,7 +145,11 @@ def _coarse_offset(
     stamps = np.asarray(camera.stamps_s[order], dtype=np.float64)
     angles = _angles(camera.camera_from_board[order])
     best = (np.inf, 0.0)
-    for offset in np.arange(-largest_s, largest_s + _STEP_S / 2, _STEP_S):
+    for offset in np.arange(
+        -largest_s,
+        largest_s + _STEP_S / 2,
+        _STEP_S,
+    ):
         poses, inside = robot.at(stamps + offset)
         overlapping = inside[:-1] & inside[1:]
         if overlapping.sum() < max(3, 0.5 * len(overlapping)):
