@@ -5,7 +5,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.board import Board, dictionary_of
-from evercal.calibration.boards.markers import STYLES
+from evercal.calibration.boards.marker_layout import STYLES
 from evercal.calibration.boards.printing import board_image
 from evercal.geometry import SE3, Camera
 

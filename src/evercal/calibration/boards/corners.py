@@ -223,7 +223,10 @@ def _projected(
     return pixels, by_pose, by_camera[:, : 4 + len(distortion)]
 
 
-def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:
+def board_pose_candidates(
+    view: BoardView,
+    camera: Camera,
+) -> list[SE3]:
     """Return the possible poses of the board: up to three for a flat board, else mostly one."""
     import cv2
 
@@ -237,7 +240,10 @@ def board_pose_candidates(view: BoardView, camera: Camera) -> list[SE3]:
         rays = camera.unproject(view.pixels)
         within = np.isfinite(rays).all(1)
         # ValueError if fewer than four are left.
-        view = BoardView(view.points_m[within], camera.pinhole.project(rays[within]))
+        view = BoardView(
+            view.points_m[within],
+            camera.pinhole.project(rays[within]),
+        )
         distortion = np.zeros(0)
     poses = []
     for solver in solvers:
@@ -300,7 +306,10 @@ def strays(
     return stray
 
 
-def _apart(view: BoardView, pose: BoardPose) -> tuple[Array, float]:
+def _apart(
+    view: BoardView,
+    pose: BoardPose,
+) -> tuple[Array, float]:
     """Return distances (k,) of the residuals from the median of their neighbours, and sigma."""
     count = min(_NEIGHBOURS + 1, pose.corners)
     near = np.asarray(KDTree(view.points_m).query(view.points_m, count)[1])

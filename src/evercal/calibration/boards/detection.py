@@ -8,9 +8,8 @@ import numpy as np
 from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.corners import BoardView, Detection
 from evercal.calibration.boards.edges import sharpened
+from evercal.calibration.boards.marker_layout import Markers, OtherBoard
 from evercal.calibration.boards.markers import (
-    Markers,
-    OtherBoard,
     find_charuco,
     find_markers,
     find_tag,
@@ -45,7 +44,10 @@ def find_boards(
     marker. Images are searched in an order that spreads. If none shows the board, InputError; also
     after a few images that show another board.
     """
-    order = sorted(range(len(names)), key=lambda i: i * (5**0.5 - 1) / 2 % 1)
+    order = sorted(
+        range(len(names)),
+        key=lambda i: i * (5**0.5 - 1) / 2 % 1,
+    )
     found: dict[str, Detection | Markers] = {}
     settled = board
     views: dict[str, Detection] = {}
@@ -63,7 +65,10 @@ def find_boards(
     return settled, {name: views[name] for name in names}
 
 
-def _require_board(views: Mapping[str, Detection], count: int) -> None:
+def _require_board(
+    views: Mapping[str, Detection],
+    count: int,
+) -> None:
     """Refuse `count` images if all, many or a few of another board were searched in vain."""
     others = []
     for name, view in views.items():
@@ -83,7 +88,10 @@ def _require_board(views: Mapping[str, Detection], count: int) -> None:
     )
 
 
-def _look(image: Image, board: Board) -> Detection | Markers:
+def _look(
+    image: Image,
+    board: Board,
+) -> Detection | Markers:
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
     if board.kind == "chessboard":
         return _find_chessboard(grey, board)
@@ -128,7 +136,10 @@ def _find_chessboard(grey: Image, board: Board) -> Detection:
     return _no_chessboard(grey, board)
 
 
-def _chessboard_candidates(grey: Image, size: tuple[int, int]) -> Iterator[Array]:
+def _chessboard_candidates(
+    grey: Image,
+    size: tuple[int, int],
+) -> Iterator[Array]:
     """Yield corners (k, 2) by OpenCV's finders, the fastest first."""
     normalized = cv2.CALIB_CB_NORMALIZE_IMAGE
     adaptive = cv2.CALIB_CB_ADAPTIVE_THRESH | normalized
@@ -149,7 +160,10 @@ def _chessboard_candidates(grey: Image, size: tuple[int, int]) -> Iterator[Array
         )
         detected, pixels = find(image, size, flags=flags)
         if detected:
-            yield resize_pixels(pixels.reshape(-1, 2).astype(np.float64), 1 / scale)
+            yield resize_pixels(
+                pixels.reshape(-1, 2).astype(np.float64),
+                1 / scale,
+            )
 
 
 def _is_even(grid: Array) -> bool:
@@ -203,9 +217,17 @@ def _first_square_is_bright(grey: Image, grid: Array) -> bool:
     rows = grid[:-1] + grid[1:]
     middle = rows[:, :-1] + grid[:-1, 1:] + grid[1:, 1:]
     middle = middle / 4
-    smooth = cv2.boxFilter(grey, -1, (3, 3))
+    smooth = cv2.boxFilter(
+        grey,
+        -1,
+        (3, 3),
+    )
     height, width = grey.shape
-    x, y = np.moveaxis(np.round(middle).astype(int), 2, 0)
+    x, y = np.moveaxis(
+        np.round(middle).astype(int),
+        2,
+        0,
+    )
     x = np.clip(x, 0, width - 1)
     y = np.clip(y, 0, height - 1)
     values = smooth[y, x]

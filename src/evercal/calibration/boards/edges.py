@@ -107,7 +107,10 @@ def _in_windows(
     return refined.astype(np.float64)
 
 
-def _steps(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
+def _steps(
+    points: Array,
+    pixels: Array,
+) -> tuple[Array, Array, Array]:
     """Return pixels (n, 2) that a corner moves with a square to the right, down, and their area.
 
     Each corner has a quadratic map by its neighbours, so that any lens will do.
@@ -115,7 +118,11 @@ def _steps(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
     differences = points[:, None] - points
     distances = np.linalg.norm(differences, axis=2)
     near = np.argsort(distances, 1)[:, 1 : _NEIGHBOURS + 1]
-    x, y = np.moveaxis(points[near] - points[:, None], 2, 0)
+    x, y = np.moveaxis(
+        points[near] - points[:, None],
+        2,
+        0,
+    )
     moved = pixels[near] - pixels[:, None]
     terms = np.stack([x, y, x * x, x * y, y * y], -1)
     slopes = np.linalg.pinv(terms) @ moved

@@ -107,7 +107,10 @@ class LensPrior(NamedTuple):
     ) -> "LensPrior":
         sigma = np.r_[np.full(4, sigma_px), sigma_terms][: len(mean)]
         sigma = np.r_[sigma, np.full(len(BEND), _BEND_SIGMA)]
-        return cls(np.r_[mean, np.zeros(len(BEND))], np.diag(sigma**-2.0))
+        return cls(
+            np.r_[mean, np.zeros(len(BEND))],
+            np.diag(sigma**-2.0),
+        )
 
 
 class Intrinsics(NamedTuple):
@@ -218,7 +221,10 @@ def calibrate_camera(
     return Intrinsics(camera, focal_sigma)
 
 
-def _consistent(views: Sequence[BoardView], camera: Camera) -> list[BoardView]:
+def _consistent(
+    views: Sequence[BoardView],
+    camera: Camera,
+) -> list[BoardView]:
     """Return the views that fit a pose of a flat board."""
     misfits = _misfits(views, camera)
     most = _MAX_MISFIT * np.median(misfits)
@@ -228,7 +234,10 @@ def _consistent(views: Sequence[BoardView], camera: Camera) -> list[BoardView]:
     return [view for view, misfit in pairs if misfit <= most]
 
 
-def _misfits(views: Sequence[BoardView], camera: Camera) -> Array:
+def _misfits(
+    views: Sequence[BoardView],
+    camera: Camera,
+) -> Array:
     """Root mean square residuals of (n,) views, pixels; inf without a pose."""
     rms = np.full(len(views), np.inf)
     for i, view in enumerate(views):
@@ -237,7 +246,10 @@ def _misfits(views: Sequence[BoardView], camera: Camera) -> Array:
     return rms
 
 
-def _middle(width: int, height: int) -> tuple[float, float]:
+def _middle(
+    width: int,
+    height: int,
+) -> tuple[float, float]:
     return (width - 1) / 2, (height - 1) / 2
 
 

@@ -55,7 +55,10 @@ def board_image(board: Board, unit_px: int) -> Image:
         )
     dictionary = dictionary_of(board)
     if board.kind == "charuco":
-        _require_marker(board, board.columns * board.rows // 2 - 1)
+        _require_marker(
+            board,
+            board.columns * board.rows // 2 - 1,
+        )
         size = (board.columns, board.rows)
         page = cv2.aruco.CharucoBoard(size, board.size_m, board.marker_m, dictionary)
         drawn = page.generateImage((board.columns * unit_px, board.rows * unit_px))

@@ -224,7 +224,10 @@ def _is_still(poses: SE3, unit_m: float) -> bool:
     return bool(metres.max() / unit_m < _AT_REST_M and radians.max() < _AT_REST_RAD)
 
 
-def held_out_error(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
+def held_out_error(
+    equation: PoseEquation,
+    fit: HandEyeFit,
+) -> dict[str, float]:
     """Median and root mean square errors of poses predicted from the others, in five folds.
 
     They include the noise of the held-out pose. Empty for fewer than six poses.
@@ -253,7 +256,10 @@ def held_out_error(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
     }
 
 
-def repeatability(equation: PoseEquation, fit: HandEyeFit) -> dict[str, float]:
+def repeatability(
+    equation: PoseEquation,
+    fit: HandEyeFit,
+) -> dict[str, float]:
     """Compare the calibrations from two halves of the sorted poses; empty for fewer than twelve."""
     rows = np.flatnonzero(fit.inliers)
     if len(rows) < _MIN_HALVED:

@@ -296,7 +296,10 @@ def _gradient(system: System, weighted: Array) -> Array:
     return np.einsum("nip,ni->p", weighted, system.residual) + from_prior
 
 
-def _step(system: System, information: Array) -> tuple[Array, float]:
+def _step(
+    system: System,
+    information: Array,
+) -> tuple[Array, float]:
     """Return the Gauss-Newton step (p,) and its squared Mahalanobis length."""
     weighted = information @ system.jacobian
     normal = _normal(system, weighted)

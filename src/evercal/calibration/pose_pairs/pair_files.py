@@ -143,7 +143,10 @@ def read_streams(files: PairFiles) -> tuple[PoseTrack, CameraTrack]:
     return _streams(robot, camera)
 
 
-def _streams(robot: _Poses, camera: _Poses) -> tuple[PoseTrack, CameraTrack]:
+def _streams(
+    robot: _Poses,
+    camera: _Poses,
+) -> tuple[PoseTrack, CameraTrack]:
     assert robot.stamps_s is not None
     assert camera.stamps_s is not None
     rows = np.flatnonzero(camera.measured)
@@ -157,7 +160,10 @@ def _streams(robot: _Poses, camera: _Poses) -> tuple[PoseTrack, CameraTrack]:
     return PoseTrack(robot.stamps_s, robot.poses), track
 
 
-def _read(files: PairFiles, role: Literal["robot", "camera"]) -> _Poses:
+def _read(
+    files: PairFiles,
+    role: Literal["robot", "camera"],
+) -> _Poses:
     """Read the poses of one file; messages name its role and its own option."""
     path = files.robot
     convention = files.robot_convention

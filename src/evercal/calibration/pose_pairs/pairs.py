@@ -97,7 +97,10 @@ class PosePairs:
                 changed[name] = value[rows]
         return replace(self, **changed)
 
-    def distinct(self, scale_known: bool = True) -> tuple[IntArray, IntArray]:
+    def distinct(
+        self,
+        scale_known: bool = True,
+    ) -> tuple[IntArray, IntArray]:
         """Return indices of different pairs, sorted by value, and (n,) the first equal pair."""
         robot = self.base_from_gripper
         camera = self.camera_from_board

@@ -207,7 +207,10 @@ class PoseEquation:
             change=np.r_[np.zeros(12), at.extras - self.extras.mean],
         )
 
-    def _noise_directions(self, at: Unknowns) -> dict[str, Array]:
+    def _noise_directions(
+        self,
+        at: Unknowns,
+    ) -> dict[str, Array]:
         """Return (n, 6, c) residuals due to unit errors of each kind, one metre or one radian."""
         # A rotation about a distant point also moves the board. Corners tell a camera's noise.
         n = len(self)

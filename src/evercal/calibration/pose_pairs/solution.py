@@ -116,7 +116,10 @@ class PairSolution:
         )
         return replace(calibration, verdict=verdict(calibration))
 
-    def _checks(self, time_offset_s: float | None) -> dict[str, Any]:
+    def _checks(
+        self,
+        time_offset_s: float | None,
+    ) -> dict[str, Any]:
         fit = self.fit
         names = self.pairs.names
         residuals = fit.residual[fit.inliers].reshape(-1, 2, 3)
@@ -158,7 +161,10 @@ class PairSolution:
             checks["camera_sigma"] = {k: sigma[k] for k in intrinsics if k in sigma}
         return checks
 
-    def _by_name(self, values: Array) -> dict[str, float]:
+    def _by_name(
+        self,
+        values: Array,
+    ) -> dict[str, float]:
         named = zip(self.rows, self.fit.inliers, values.tolist(), strict=True)
         return {self.pairs.names[i]: value for i, used, value in named if used}
 

@@ -178,7 +178,11 @@ def _predicted(
     return SE3(predicted.rotation_wxyz, predicted.translation_m / scale)
 
 
-def _slip_warning(slip: Slip, names: Sequence[str], of_board: bool) -> str:
+def _slip_warning(
+    slip: Slip,
+    names: Sequence[str],
+    of_board: bool,
+) -> str:
     what = slip.what
     if not of_board:
         what = what.replace("board", "map")

@@ -165,7 +165,10 @@ def _sine_axes(rotations: Array) -> Array:
     return np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
 
 
-def _spread(rotations: Array, translations: Array) -> tuple[Array, Array, Array]:
+def _spread(
+    rotations: Array,
+    translations: Array,
+) -> tuple[Array, Array, Array]:
     """Return the (h,) logarithmic spread of the better half of n boards, and their mean."""
     h, n = translations.shape[:2]
     half = min(n, (n + 4) // 2)
