@@ -2,9 +2,9 @@
 
 import json
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -37,10 +37,14 @@ from .printed import (
 )
 
 
-def detect(board: Board, pose: SE3, seed: int = 0) -> BoardView:
-    view = find_board(photographed(board, pose, seed), board)
+def corners_in(image: np.ndarray, board: Board) -> BoardView:
+    view = find_board(image, board)
     assert isinstance(view, BoardView), view
     return view
+
+
+def detect(board: Board, pose: SE3, seed: int = 0) -> BoardView:
+    return corners_in(photographed(board, pose, seed), board)
 
 
 @pytest.mark.parametrize("board", BOARDS, ids=lambda b: b.kind)
@@ -82,36 +86,36 @@ def test_images_without_the_board_give_a_reason() -> None:
 
 
 @pytest.mark.parametrize(
-    ("create", "message"),
+    ("board", "message"),
     [
-        (lambda: Board("chessboard", 0.03), "size of 3x3 to 200x200"),
-        (lambda: Board("chessboard", 0.0, 9, 6), "allowed are 0.5 to 2000 mm"),
+        (("chessboard", 0.03), "size of 3x3 to 200x200"),
+        (("chessboard", 0.0, 9, 6), "allowed are 0.5 to 2000 mm"),
         (
-            lambda: Board("chessboard", 0.025e-3, 9, 6),
+            ("chessboard", 0.025e-3, 9, 6),
             "is 0.025 mm; allowed are 0.5 to 2000 mm",
         ),
         (
-            lambda: Board("chessboard", 25.0, 9, 6),
+            ("chessboard", 25.0, 9, 6),
             "is 25000 mm; .*give millimetres: `square_mm`",
         ),
-        (lambda: Board("chessboard", 0.025, 900, 6), "got 900x6"),
+        (("chessboard", 0.025, 900, 6), "got 900x6"),
         (
-            lambda: Board("aprilgrid", 0.03, 6, 6),
+            ("aprilgrid", 0.03, 6, 6),
             "is 0 mm; give `gap_mm`: .* Kalibr's tagSpacing",
         ),
         (
-            lambda: Board("charuco", 0.03, 5, 7, 0.04, "4X4_50"),
+            ("charuco", 0.03, 5, 7, 0.04, "4X4_50"),
             "markers of a ChArUco board",
         ),
         (
-            lambda: Board("apriltag", 0.03, dictionary="36h11"),
+            ("apriltag", 0.03, 0, 0, 0.0, "36h11"),
             "dictionary '36h11' is not known",
         ),
     ],
 )
-def test_invalid_boards_are_refused(create: Callable[[], Board], message: str) -> None:
+def test_invalid_boards_are_refused(board: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        create()
+        Board(*board)
 
 
 def test_only_chessboards_of_even_sum_look_the_same_after_half_a_turn() -> None:
@@ -267,8 +271,7 @@ def test_charuco_boards_of_older_opencv_are_detected() -> None:
     page = cv2.aruco.CharucoBoard((5, 6), 0.04, 0.03, dictionary)
     page.setLegacyPattern(True)
     image = page.generateImage((600, 720), marginSize=40)
-    view = find_board(np.repeat(image[..., None], 3, 2).astype(np.uint8), board)
-    assert isinstance(view, BoardView)
+    view = corners_in(np.repeat(image[..., None], 3, 2).astype(np.uint8), board)
     assert len(view.points_m) == 20
 
 
@@ -301,8 +304,7 @@ def kalibr_print(pixels_a_bit: int = 12) -> np.ndarray:
 def test_a_grid_of_kalibr_has_the_frame_of_kalibr() -> None:
     image = cv2.GaussianBlur(kalibr_print(), (0, 0), 1.0).astype(np.uint8)
     board = Board("aprilgrid", 0.1, 2, 2, dictionary="APRILTAG_36h11", gap_m=0.03)
-    view = find_board(np.repeat(image[..., None], 3, 2), board)
-    assert isinstance(view, BoardView), view
+    view = corners_in(np.repeat(image[..., None], 3, 2), board)
     assert len(view.pixels) == 16
     # The origin is the lower left corner of tag 0, y goes up.
     origin = np.array([8 * 12 - 0.5, (8 + 13 + 10) * 12 - 0.5])
@@ -320,8 +322,7 @@ def test_squares_of_kalibr_do_not_move_the_corners_of_a_tag() -> None:
         error = whole.pixels - CAMERA.project(pose.apply(whole.points_m))
         assert len(whole.pixels) == 48
         grid.append((error**2).mean())
-        view = find_board(photographed(APRILGRID, pose, seed), tag)
-        assert isinstance(view, BoardView), view
+        view = corners_in(photographed(APRILGRID, pose, seed), tag)
         near = np.linalg.norm(whole.pixels[:, None] - view.pixels, axis=2).min(0)
         alone.append(np.square(near).mean())
     assert np.sqrt(np.mean(grid)) < 0.05
@@ -444,3 +445,11 @@ def test_every_window_of_refinement_stays_between_edges() -> None:
     view = detect(CHESSBOARD, pose)
     error = view.pixels - CAMERA.project(pose.apply(view.points_m))
     assert np.sqrt((error**2).mean()) < 0.06
+
+
+def test_an_image_that_cannot_be_read_keeps_its_reason_beside_a_grid() -> None:
+    shown = photographed(APRILGRID, view_of(APRILGRID, 0))
+    images = {"good": shown, "bad": "not an image"}
+    _, views = find_boards(list(images), images.__getitem__, APRILGRID)
+    assert views["bad"] == "not an image"
+    assert isinstance(views["good"], BoardView)

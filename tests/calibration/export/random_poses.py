@@ -9,6 +9,7 @@ from evercal.geometry import SE3, Camera
 from evercal.robot.mount import MountName
 from evercal.typing import Array
 
+POSE = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
 CAMERA = Camera(640, 480, 600.25, 601.5, 319.75, 240.5, (0.1, -0.2, 0.001, 0.002, 0.03))
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from numpy.testing import assert_allclose
 
 from evercal.calibration.export.request import (
     ExportOptions,
@@ -15,7 +16,7 @@ from evercal.calibration.export.request import (
 from evercal.errors import InputError
 from evercal.geometry import SE3, cross_matrix, pose_distance
 
-from .random_poses import calibration_of
+from .random_poses import POSE, calibration_of
 
 
 def test_axes_follow_rep_103() -> None:
@@ -23,31 +24,27 @@ def test_axes_follow_rep_103() -> None:
     link_from_optical = standard_link_from_optical((0.01, 0.02, 0.03))
     axes = link_from_optical.apply([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
     offset = np.array([0.01, 0.02, 0.03])
-    np.testing.assert_allclose(
-        axes - offset, [[1, 0, 0], [0, -1, 0], [0, 0, -1]], atol=1e-12
-    )
+    assert_allclose(axes - offset, [[1, 0, 0], [0, -1, 0], [0, 0, -1]], atol=1e-12)
 
 
 def test_the_covariance_is_propagated_to_the_link() -> None:
     """A lever arm adds the uncertainty of the rotation to that of the translation."""
-    pose = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
     offset = (0.1, 0.2, -0.3)
     options = ExportOptions(via="camera_link", via_offset=offset)
-    moved = prepare_export(calibration_of(pose), **options).calibration
+    calibration = calibration_of(POSE)
+    moved = prepare_export(calibration, **options).calibration
     assert (moved.parent_frame, moved.child_frame) == ("base_link", "camera_link")
     optical_from_link = standard_link_from_optical(offset).inverse()
     assert (
-        np.max(pose_distance(moved.parent_from_child, pose @ optical_from_link)) < 1e-9
+        np.max(pose_distance(moved.parent_from_child, POSE @ optical_from_link)) < 1e-9
     )
-    covariance = calibration_of(pose).covariance
-    lever = pose.rotation_matrix() @ cross_matrix(optical_from_link.translation_m)
+    covariance = calibration.covariance
+    lever = POSE.rotation_matrix() @ cross_matrix(optical_from_link.translation_m)
     expected = covariance[:3, :3] + lever @ covariance[3:, 3:] @ lever.T
-    np.testing.assert_allclose(moved.covariance[:3, :3], expected, rtol=1e-9)
+    assert_allclose(moved.covariance[:3, :3], expected, rtol=1e-9)
     turned = optical_from_link.rotation_matrix().T
     expected = turned @ covariance[3:, 3:] @ turned.T
-    np.testing.assert_allclose(
-        moved.covariance[3:, 3:], expected, rtol=1e-9, atol=1e-20
-    )
+    assert_allclose(moved.covariance[3:, 3:], expected, rtol=1e-9, atol=1e-20)
 
 
 def entry(parent: str, child: str, pose: SE3) -> dict:

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from numpy.testing import assert_allclose, assert_array_equal
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 
-from .random_poses import CAMERA, calibration_of, quaternion_matrix, random_poses
+from .random_poses import CAMERA, POSE, calibration_of, quaternion_matrix, random_poses
 
 DISTORTIONS = [(), (0.1, -0.2, 0.001, 0.002), CAMERA.distortion]
 RATIONAL = (0.1, -0.2, 0.001, 0.002, 0.03, 0.01, 0.02, 0.03)
@@ -37,21 +38,20 @@ def test_colmap_projects_like_the_camera(
     tmp_path: Path, distortion: tuple[float, ...]
 ) -> None:
     camera = camera_with(distortion)
-    pose = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
-    calibration_of(pose, camera=camera).export("colmap", tmp_path / "model")
+    calibration_of(POSE, camera=camera).export("colmap", tmp_path / "model")
     model = read_colmap(tmp_path / "model")
     assert sorted(image.name for image in model.images.values()) == ["a.png", "c.png"]
-    points = pose.apply(
+    points = POSE.apply(
         np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (20, 3))
     )
     for image in model.images.values():
         camera_from_base = image.cam_from_world()
         pixels = model.cameras[image.camera_id].img_from_cam(camera_from_base * points)
         # COLMAP's pixel coordinates start at the corner of the first pixel.
-        expected = camera.project(pose.inverse().apply(points))
-        np.testing.assert_allclose(pixels - 0.5, expected, atol=1e-6)
-        np.testing.assert_allclose(
-            camera_from_base.matrix() @ pose.matrix(), np.eye(4)[:3], atol=1e-9
+        expected = camera.project(POSE.inverse().apply(points))
+        assert_allclose(pixels - 0.5, expected, atol=1e-6)
+        assert_allclose(
+            camera_from_base.matrix() @ POSE.matrix(), np.eye(4)[:3], atol=1e-9
         )
 
 
@@ -64,9 +64,7 @@ def test_colmap_of_a_camera_on_the_arm(tmp_path: Path) -> None:
     for image in model.images.values():
         base_from_gripper = random_poses()[names.index(image.name)].matrix()
         expected = np.linalg.inv(base_from_gripper @ ON_ARM.parent_from_child.matrix())
-        np.testing.assert_allclose(
-            image.cam_from_world().matrix(), expected[:3], atol=1e-9
-        )
+        assert_allclose(image.cam_from_world().matrix(), expected[:3], atol=1e-9)
 
 
 def test_colmap_does_not_overwrite_a_model(tmp_path: Path) -> None:
@@ -86,8 +84,7 @@ def test_colmap_refuses_blanks_in_names(tmp_path: Path) -> None:
 
 def test_nerfstudio_rays_match_the_camera() -> None:
     camera = camera_with(())
-    pose = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
-    meta = json.loads(calibration_of(pose, camera=camera).export("nerfstudio"))
+    meta = json.loads(calibration_of(POSE, camera=camera).export("nerfstudio"))
     assert [frame["file_path"] for frame in meta["frames"]] == ["a.png", "c.png"]
     assert (meta["w"], meta["h"], meta["camera_model"]) == (640, 480, "OPENCV")
     pixels = np.random.default_rng(0).uniform(0, 480, (10, 2))
@@ -98,9 +95,9 @@ def test_nerfstudio_rays_match_the_camera() -> None:
     rays = np.stack([x, y, -np.ones_like(x)], axis=-1)
     for frame in meta["frames"]:
         matrix = np.array(frame["transform_matrix"])
-        world = camera.unproject(pixels) @ pose.rotation_matrix().T
-        np.testing.assert_allclose(rays @ matrix[:3, :3].T, world, atol=1e-9)
-        np.testing.assert_allclose(matrix[:, 3], [*pose.translation_m, 1], atol=1e-12)
+        world = camera.unproject(pixels) @ POSE.rotation_matrix().T
+        assert_allclose(rays @ matrix[:3, :3].T, world, atol=1e-9)
+        assert_allclose(matrix[:, 3], [*POSE.translation_m, 1], atol=1e-12)
 
 
 @pytest.mark.parametrize("distortion", DISTORTIONS)
@@ -122,9 +119,7 @@ def test_nerfstudio_distortion_is_its_polynomial(distortion: tuple[float, ...]) 
         meta["fl_y"] * (y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y))
         + meta["cy"]
     )
-    np.testing.assert_allclose(
-        np.stack([u, v], -1) - 0.5, camera.project(points), atol=1e-9
-    )
+    assert_allclose(np.stack([u, v], -1) - 0.5, camera.project(points), atol=1e-9)
 
 
 def test_nerfstudio_refuses_rational_distortion() -> None:
@@ -134,10 +129,9 @@ def test_nerfstudio_refuses_rational_distortion() -> None:
 
 
 def test_tum_of_a_fixed_camera_is_one_line() -> None:
-    pose = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
-    line = np.loadtxt(io.StringIO(calibration_of(pose).export("tum")))
+    line = np.loadtxt(io.StringIO(calibration_of(POSE).export("tum")))
     matrix = quaternion_matrix(*line[4:], translation=line[1:4])
-    np.testing.assert_allclose(matrix, pose.matrix(), atol=1e-9)
+    assert_allclose(matrix, POSE.matrix(), atol=1e-9)
 
 
 def test_tum_of_a_camera_on_the_arm(tmp_path: Path) -> None:
@@ -145,11 +139,11 @@ def test_tum_of_a_camera_on_the_arm(tmp_path: Path) -> None:
     robot = RobotPoses(None, stamps, random_poses())
     ON_ARM.export("tum", tmp_path / "a.tum", robot_poses=robot)
     lines = np.loadtxt(tmp_path / "a.tum")
-    np.testing.assert_array_equal(lines[:, 0], stamps)
+    assert_array_equal(lines[:, 0], stamps)
     expected = random_poses() @ ON_ARM.parent_from_child
     for line, matrix in zip(lines, expected.matrix(), strict=True):
         actual = quaternion_matrix(*line[4:], translation=line[1:4])
-        np.testing.assert_allclose(actual, matrix, atol=1e-9)
+        assert_allclose(actual, matrix, atol=1e-9)
     assert (
         np.max(pose_distance(read_robot_poses(tmp_path / "a.tum").poses, expected))
         < 1e-12
@@ -205,8 +199,8 @@ def test_moveit_samples_are_pairs_of_matrices(named: bool) -> None:
         assert all(type(value) is float for row in sample.values() for value in row)
         gripper = np.reshape(sample["effector_wrt_world"], (4, 4))
         board = np.reshape(sample["object_wrt_sensor"], (4, 4))
-        np.testing.assert_allclose(gripper, robot[i].matrix(), atol=1e-12)
-        np.testing.assert_allclose(board, target[i].matrix(), atol=1e-12)
+        assert_allclose(gripper, robot[i].matrix(), atol=1e-12)
+        assert_allclose(board, target[i].matrix(), atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from evercal.calibration.calibration import Calibration, JointOffset
 from evercal.errors import InputError
@@ -187,7 +188,7 @@ def test_json_states_units_and_what_is_open() -> None:
     assert joints["elbow"]["offset_deg"] == pytest.approx(np.rad2deg(0.031))
     assert joints["elbow"]["sigma_rad"] == 0.002
     assert joints["rail"] == {"offset_m": -0.004, "sigma_m": 0.0005, "open": ""}
-    np.testing.assert_array_equal(record["covariance"], ARM.joint_covariance)
+    assert_array_equal(record["covariance"], ARM.joint_covariance)
     zero = with_joints(replace(JOINTS[1], offset=0.0)).export("joint_offsets")
     assert json.loads(zero)["joints"]["elbow"]["offset_deg"] == 0.0
 

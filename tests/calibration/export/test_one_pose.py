@@ -18,6 +18,7 @@ import yaml
 import yourdfpy
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.export.formats import FORMATS
@@ -29,7 +30,7 @@ from evercal.recordings.poses.robot_poses import read_robot_poses
 from evercal.robot.mount import MountName
 from evercal.typing import Array
 
-from .random_poses import CAMERA, calibration_of, poses, quaternion_matrix
+from .random_poses import CAMERA, POSE, calibration_of, poses, quaternion_matrix
 
 Read = tuple[Array, str, str]
 """Matrix parent_from_child, and the names of both frames; empty if the format has none."""
@@ -272,31 +273,29 @@ def test_the_pose_and_its_frames_are_read_back(
     tolerance = (
         3e-7 if np.isclose(np.abs(rotation), 1, rtol=0, atol=1e-9).any() else 4e-9
     )
-    np.testing.assert_allclose(matrix[:3, :3], rotation, atol=tolerance)
-    np.testing.assert_allclose(matrix[:3, 3], pose.translation_m, atol=2e-9)
-    np.testing.assert_allclose(matrix[3], [0, 0, 0, 1])
+    assert_allclose(matrix[:3, :3], rotation, atol=tolerance)
+    assert_allclose(matrix[:3, 3], pose.translation_m, atol=2e-9)
+    assert_allclose(matrix[3], [0, 0, 0, 1])
 
 
 def test_opencv_projects_with_its_intrinsics() -> None:
-    pose = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
-    values = read_opencv(calibration_of(pose).export("opencv"))
-    points = pose.apply([[0.1, 0.2, 1.0], [-0.3, 0.1, 2.0], [0.0, 0.0, 0.5]])
+    values = read_opencv(calibration_of(POSE).export("opencv"))
+    points = POSE.apply([[0.1, 0.2, 1.0], [-0.3, 0.1, 2.0], [0.0, 0.0, 0.5]])
     keys = ("rvec", "tvec", "camera_matrix", "distortion_coefficients")
     rvec, tvec, matrix, distortion = (np.asarray(values[key]) for key in keys)
     projected = cv2.projectPoints(points, rvec, tvec, matrix, distortion)[0]
-    expected = CAMERA.project(pose.inverse().apply(points))
-    np.testing.assert_allclose(projected[:, 0], expected, atol=1e-6)
+    expected = CAMERA.project(POSE.inverse().apply(points))
+    assert_allclose(projected[:, 0], expected, atol=1e-6)
     assert (values["image_width"], values["image_height"]) == (640, 480)
-    without = calibration_of(pose, camera=None).export("opencv")
+    without = calibration_of(POSE, camera=None).export("opencv")
     assert read_opencv(without).keys() == {"rvec", "tvec"}
 
 
 def test_files_of_matrices_are_poses_of_robots(tmp_path: Path) -> None:
-    pose = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
     for name in ("json", "npy"):
-        calibration_of(pose).export(name, tmp_path / f"pose.{name}")
+        calibration_of(POSE).export(name, tmp_path / f"pose.{name}")
         (read,) = read_robot_poses(tmp_path / f"pose.{name}").poses
-        assert max(pose_distance(read, pose)) < 1e-12
+        assert max(pose_distance(read, POSE)) < 1e-12
     record = json.loads((tmp_path / "pose.json").read_text())
     assert (record["parent_frame"], record["child_frame"]) == ("base_link", CHILD)
 
@@ -329,7 +328,7 @@ def test_camera_info(tmp_path: Path, count: int) -> None:
     for key in ("camera_matrix", "projection_matrix", "distortion_coefficients"):
         assert info[key]["rows"] * info[key]["cols"] == len(info[key]["data"])
     read = read_camera(tmp_path / "info.yaml")
-    np.testing.assert_array_equal(read.matrix(), camera.matrix())
+    assert_array_equal(read.matrix(), camera.matrix())
     assert (read.width, read.height) == (640, 480)
     assert np.trim_zeros(read.distortion, "b") == distortion
 

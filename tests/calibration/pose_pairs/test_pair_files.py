@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from evercal.calibration.pose_pairs.pair_files import PairFiles, read_pairs
 from evercal.errors import InputError
@@ -24,9 +25,7 @@ def test_names_are_paired_without_folder_and_suffix(tmp_path: Path) -> None:
         tmp_path / "camera.csv", ["rgb/1.75.png", "rgb/1.25.png", "rgb/1.50.png"]
     )
     pairs, _ = read_pairs(PairFiles(robot, camera))
-    np.testing.assert_allclose(
-        pairs.base_from_gripper.translation_m[:, 1], [0.02, 0, 0.01]
-    )
+    assert_allclose(pairs.base_from_gripper.translation_m[:, 1], [0.02, 0, 0.01])
 
 
 def test_names_that_match_partly_are_shown(tmp_path: Path) -> None:
