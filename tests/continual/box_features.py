@@ -9,6 +9,7 @@ from torch import Tensor
 
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.descriptor import GlobalDescriptor
+from evercal.continual.networks.head import Head, HeadOptions, fresh_head
 from evercal.features.views import View, cell_centres
 from evercal.geometry import SE3, Camera
 from evercal.simulation.box_room import BoxRoom
@@ -62,3 +63,15 @@ def learnable(box: BoxRoom) -> Learnable:
         return buffer, torch.cat(everything)
 
     return make
+
+
+def head_at_cameras(
+    buffers: list[FeatureBuffer], options: HeadOptions | None = None
+) -> Head:
+    """A head for scenes of `learnable`, with centres at three cameras of each."""
+    head = fresh_head(CHANNELS, 6, options or HeadOptions(width=32), seed=0)
+    for buffer in buffers:
+        matrix = buffer.tensors["camera_from_atlas"][:3].double().numpy()
+        cameras = SE3.from_matrix(matrix).inverse().translation_m
+        head.grow(torch.from_numpy(cameras).float(), seed=buffer.scene)
+    return head

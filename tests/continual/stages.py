@@ -16,6 +16,7 @@ from evercal.recordings.frame import Recording
 
 EmptyScenes = Callable[[str], LearnedScenes]
 MakeStore = Callable[[Path, Sequence[LearnedScenes]], NetworkStore]
+Stages = dict[str, LearnedScenes]
 Rooms = tuple[Recording, Recording, Recording]
 Tree = Callable[[Path], dict[str, str]]
 

@@ -87,7 +87,7 @@ class NetworkLocalizer:
         cameras = _fitting_cameras(camera, image, scenes.scenes)
         features = scenes.encoder.encode(image, scenes.short_side)
         encoded = Encoded(features)
-        tried: list[Rough | None] = []
+        tried = []
         for scene in self._candidates(encoded, cameras):
             tried.append(self._hypothesis(encoded, scene, cameras))
         best = max(tried, key=_support)
@@ -215,7 +215,7 @@ def _fitting_cameras(
     """Intrinsics of an image in each scene, never guessed; None where its shape does not fit."""
     height, width = image.shape[:2]
     cameras: list[Camera | None] = list(cameras_in_scenes(camera, image, scenes))
-    sizes: list[str] = []
+    sizes = []
     for i, scene in enumerate(scenes):
         recorded = scene.adjusted_camera
         sizes.append(f"{scene.name} {recorded.width}x{recorded.height}")

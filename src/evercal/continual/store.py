@@ -108,7 +108,7 @@ class NetworkStore(StageStore[LearnedScenes]):
         keyframes = None
         if listed(KEYFRAMES):
             keyframes = Keyframes.from_tensors(load_tensors(folder / KEYFRAMES))
-        state: dict[str, Tensor] = {}
+        state = {}
         if listed(STATE):
             state = _tensors(folder / STATE)
         scenes.scenes.append(_read_record(folder))

@@ -44,8 +44,8 @@ def fit_threshold(
     records = list(scenes.scenes)
     records[index] = replace(records[index], inlier_threshold=0.0, covariance_scale=1.0)
     localizer = NetworkLocalizer(replace(scenes, scenes=records))
-    squared: list[float] = []
-    positives: list[float] = []
+    squared = []
+    positives = []
     for frame in held_out:
         estimate = localizer.localize(frame.read_image(), frame.camera)
         positives.append(estimate.inlier_ratio)
@@ -56,7 +56,7 @@ def fit_threshold(
         if metres < _NEAR_M and radians < _NEAR_RAD:
             squared.append(pose.squared_mahalanobis(frame.base_from_camera))
     small = records[index].camera.short_side_resized(scenes.short_side)
-    negatives: list[float] = []
+    negatives = []
     for image in _negative_views(small.width, small.height):
         negatives.append(localizer.localize(image).inlier_ratio)
     high = float(np.quantile(negatives, 0.95))
@@ -71,7 +71,7 @@ def fit_threshold(
 @lru_cache(maxsize=4)
 def _negative_views(width: int, height: int) -> list[Image]:
     camera = default_camera(width, height)
-    images: list[Image] = []
+    images = []
     for seed in range(NEGATIVE_ROOM_SEED, NEGATIVE_ROOM_SEED + _NEGATIVE_ROOMS):
         room = BoxRoom(seed, texture_px=192)
         rng = np.random.default_rng(seed)

@@ -232,7 +232,7 @@ def _wave(
     rng: Generator,
 ) -> Array:
     """A random smooth function of angles (n,) with a period of 2 pi / cycles, in [0, 1]."""
-    harmonics: list[tuple[int, float, float]] = []
+    harmonics = []
     for number in (1, 2, 3):
         amplitude = rng.uniform(0.4, 1) / number
         phase = rng.uniform(0, 2 * np.pi)

@@ -69,7 +69,7 @@ def arm_surfaces(joints_rad: Array) -> list[Surface]:
     frames = joint_frames(joints_rad)
     origins = frames[[0, 2, 3, 4, 6, 7], :3, 3]
     points = np.concatenate([np.zeros((1, 3)), origins])
-    surfaces: list[Surface] = []
+    surfaces = []
     for start, end in pairwise(points):
         along = end - start
         length = np.linalg.norm(along)
@@ -91,7 +91,7 @@ def arm_surfaces(joints_rad: Array) -> list[Surface]:
 def thing_surfaces(seed: int, base_from_gripper: SE3) -> list[Surface]:
     """The textured box that the gripper holds."""
     rotation = base_from_gripper.rotation_matrix()
-    surfaces: list[Surface] = []
+    surfaces = []
     for thing in _thing(seed):
         in_base = Surface(
             corner_m=base_from_gripper.apply(thing.corner_m),

@@ -252,7 +252,7 @@ def _random_poses(
     """Usable gripper poses (count,) for random joint angles."""
     rng = default_rng(seed)
     mean, spread = _ARM_POSES_RAD.T
-    poses: list[SE3] = []
+    poses = []
     while len(poses) < count:
         joints = mean + spread * rng.uniform(-1, 1, 7)
         gripper = base_from_flange(joints)

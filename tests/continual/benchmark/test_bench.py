@@ -44,6 +44,9 @@ if TYPE_CHECKING:
     Arcs = tuple[Recording, Recording]
 
 
+Complete = tuple[Path, list[CompletedStage]]
+
+
 def named(*names: str) -> tuple[Strategy, ...]:
     return tuple(strategy_named(name) for name in names)
 
@@ -93,14 +96,14 @@ def comparable(out: Path, *strategies: str) -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def complete(
     arcs: Arcs, options: BenchOptions, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, list[CompletedStage]]:
+) -> Complete:
     """The folder of a complete benchmark, and its steps."""
     out = tmp_path_factory.mktemp("bench")
     return out, list(run_bench(arcs, options, out))
 
 
 def test_all_learned_scenes_are_evaluated_after_every_stage(
-    complete: tuple[Path, list[CompletedStage]],
+    complete: Complete,
 ) -> None:
     out, steps = complete
     names = ["er", "er", "finetune", "finetune", "joint", "joint"]
@@ -122,7 +125,7 @@ def test_all_learned_scenes_are_evaluated_after_every_stage(
 
 
 def test_strategies_share_the_first_stage(
-    complete: tuple[Path, list[CompletedStage]],
+    complete: Complete,
 ) -> None:
     out, _ = complete
     first = read(out).query("stage == 0").set_index("strategy")
@@ -138,7 +141,7 @@ def test_strategies_share_the_first_stage(
 def test_processes_share_the_runs(
     arcs: Arcs,
     options: BenchOptions,
-    complete: tuple[Path, list[CompletedStage]],
+    complete: Complete,
     tmp_path: Path,
 ) -> None:
     """While one process has a run, another takes the others; together they have all."""
@@ -152,7 +155,7 @@ def test_processes_share_the_runs(
 
 
 def test_options_that_decide_a_result_are_recorded(
-    complete: tuple[Path, list[CompletedStage]],
+    complete: Complete,
 ) -> None:
     settings = json.loads((complete[0] / SETTINGS).read_text())
     assert settings["fit"]["iterations"] == 6
@@ -187,7 +190,7 @@ def test_settings_name_every_constant_of_acceptance() -> None:
 def test_interruption_does_not_change_results(
     arcs: Arcs,
     options: BenchOptions,
-    complete: tuple[Path, list[CompletedStage]],
+    complete: Complete,
     tmp_path: Path,
     stages: int,
 ) -> None:
@@ -231,7 +234,7 @@ def test_missing_rows_of_a_stage_are_added(
 
 
 def test_other_settings_and_strategies_are_refused(
-    arcs: Arcs, options: BenchOptions, complete: tuple[Path, list[CompletedStage]]
+    arcs: Arcs, options: BenchOptions, complete: Complete
 ) -> None:
     other = replace(strategy_named("er"), method=Replay("sars", weight=0.3))
     for change, message in (
@@ -254,7 +257,7 @@ def test_other_settings_and_strategies_are_refused(
 def test_strategies_can_be_added(
     arcs: Arcs,
     options: BenchOptions,
-    complete: tuple[Path, list[CompletedStage]],
+    complete: Complete,
     tmp_path: Path,
 ) -> None:
     row = Strategy("er_3", Replay(weight=0.9))

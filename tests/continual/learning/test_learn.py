@@ -25,7 +25,15 @@ from evercal.geometry import SE3, pose_distance
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.recordings.frame import Frame, Recording, stated_poses
 
-from ..stages import EmptyScenes, Rooms, assert_same, learn, second_stage, weights
+from ..stages import (
+    EmptyScenes,
+    Rooms,
+    Stages,
+    assert_same,
+    learn,
+    second_stage,
+    weights,
+)
 
 NETWORK = STRATEGIES["evercal_network"]
 SCENE_BY_SCENE = ["evercal_network", "gec", "mir", "lwf", "isolation"]
@@ -43,7 +51,7 @@ def posed(frame: Frame) -> SE3:
 
 
 def test_events_are_in_order(
-    first_stages: dict[str, LearnedScenes], rooms: Rooms, quick: StageOptions
+    first_stages: Stages, rooms: Rooms, quick: StageOptions
 ) -> None:
     events: list[Encoding | Progress] = []
     second_stage(first_stages["evercal_network"], rooms, quick, events.append)
@@ -67,7 +75,7 @@ def test_events_are_in_order(
 
 @pytest.mark.parametrize("name", SCENE_BY_SCENE)
 def test_stage_leaves_its_input_unchanged(
-    name: str, first_stages: dict[str, LearnedScenes], rooms: Rooms, quick: StageOptions
+    name: str, first_stages: Stages, rooms: Rooms, quick: StageOptions
 ) -> None:
     scenes = first_stages[name]
     before = [weights(head) for head in scenes.heads]
@@ -115,7 +123,7 @@ def test_memory_in_bytes_is_respected_and_used(
 
 @pytest.mark.parametrize("name", ["evercal_network", "isolation"])
 def test_whitening_is_fitted_to_the_first_scene_only(
-    name: str, first_stages: dict[str, LearnedScenes], rooms: Rooms, quick: StageOptions
+    name: str, first_stages: Stages, rooms: Rooms, quick: StageOptions
 ) -> None:
     before = first_stages[name].heads[0]
     assert not torch.equal(before.feature_map, torch.eye(before.features))
@@ -125,7 +133,7 @@ def test_whitening_is_fitted_to_the_first_scene_only(
 
 
 def test_centres_lie_in_the_cell_of_their_scene(
-    first_stages: dict[str, LearnedScenes], rooms: Rooms, quick: StageOptions
+    first_stages: Stages, rooms: Rooms, quick: StageOptions
 ) -> None:
     after = second_stage(first_stages["evercal_network"], rooms, quick)
     head = after.heads[0]
@@ -156,7 +164,7 @@ class RecordingPenalty(Penalty):
 
 
 def test_replayed_rows_are_of_old_scenes_and_the_teacher_is_the_old_head(
-    first_stages: dict[str, LearnedScenes], rooms: Rooms, quick: StageOptions
+    first_stages: Stages, rooms: Rooms, quick: StageOptions
 ) -> None:
     scenes = first_stages["evercal_network"]
     keyframes = scenes.keyframes[0]
@@ -189,7 +197,7 @@ def test_replayed_rows_are_of_old_scenes_and_the_teacher_is_the_old_head(
 
 
 def test_training_depends_on_the_seed_only(
-    first_stages: dict[str, LearnedScenes], rooms: Rooms, quick: StageOptions
+    first_stages: Stages, rooms: Rooms, quick: StageOptions
 ) -> None:
     scenes = first_stages["evercal_network"]
     torch.manual_seed(12345)

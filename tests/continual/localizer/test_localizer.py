@@ -27,10 +27,8 @@ WIDE = Camera(640, 480, 400.0, 410.0, 300.0, 250.0)
 def test_pose_is_in_the_base_frame_of_its_scene(scene: int) -> None:
     world = make_world((CAMERA,) * 3)
     image = world.view(scene)
-    localizer = NetworkLocalizer(world.scenes)
-    assert localizer.scenes == ("scene-0", "scene-1", "scene-2")
-    estimate = localizer.localize(image, CAMERA)
-    world.assert_located(estimate, image, f"scene-{scene}")
+    assert NetworkLocalizer(world.scenes).scenes == ("scene-0", "scene-1", "scene-2")
+    estimate = world.assert_located(image, scene, CAMERA)
     assert estimate.inliers == 20 * 15
     assert estimate.inlier_ratio == 1.0
     assert estimate.milliseconds > 0
@@ -45,13 +43,12 @@ def test_pose_is_in_the_base_frame_of_its_scene(scene: int) -> None:
 
 def test_default_camera_is_that_of_the_scene() -> None:
     world = make_world((CAMERA, WIDE))
-    localizer = NetworkLocalizer(world.scenes)
     for size in ((640, 480), (320, 240), (160, 120), (80, 60)):
         for scene, camera in enumerate((CAMERA, WIDE)):
             image = world.view(scene, camera, size)
-            world.assert_located(localizer.localize(image), image, f"scene-{scene}")
+            world.assert_located(image, scene)
     image = world.view(1, WIDE)
-    estimate = localizer.localize(image, CAMERA)
+    estimate = world.localize(image, CAMERA)
     assert estimate.base_from_camera is None or (
         pose_distance(estimate.base_from_camera, world.pose(image))[0] > 0.05
     )
@@ -59,27 +56,24 @@ def test_default_camera_is_that_of_the_scene() -> None:
 
 def test_given_camera_can_have_any_size_and_distortion() -> None:
     world = make_world()
-    localizer = NetworkLocalizer(world.scenes)
     distorted = Camera(
         320, 240, 262.0, 262.0, 150.0, 130.0, (-0.2, 0.05, 0.001, -0.002)
     )
     image = world.view(0, distorted)
     for camera in (distorted, distorted.resized(640, 480), distorted.resized(160, 120)):
-        world.assert_located(localizer.localize(image, camera), image, "scene-0")
+        world.assert_located(image, 0, camera)
 
 
 def test_only_scenes_of_the_image_aspect_ratio_are_tried() -> None:
     portrait = Camera(120, 160, 130.0, 130.0, 60.0, 80.0)
     world = make_world((CAMERA, portrait))
     image = world.view(1, portrait)
-    world.assert_located(
-        NetworkLocalizer(world.scenes).localize(image), image, "scene-1"
-    )
+    world.assert_located(image, 1)
     assert world.head.scenes_asked == [1]
     with pytest.raises(
         InputError, match=r"image 160x90.*scene-0 160x120.*scene-1 120x160"
     ):
-        NetworkLocalizer(world.scenes).localize(np.zeros((90, 160, 3), np.uint8))
+        world.localize(np.zeros((90, 160, 3), np.uint8))
 
 
 def test_pose_outside_the_cell_of_its_scene_fails() -> None:
@@ -87,7 +81,7 @@ def test_pose_outside_the_cell_of_its_scene_fails() -> None:
     world = make_world()
     image = world.view(1, predicted_for=0)
     world.describe(image, [1.0, 0, 0, 0])
-    estimate = NetworkLocalizer(world.scenes).localize(image)
+    estimate = world.localize(image)
     assert estimate.status == "failed"
     assert "cell" in estimate.reason
     assert estimate.scene is None
@@ -98,7 +92,7 @@ def test_pose_outside_the_cell_of_its_scene_fails() -> None:
 def test_image_with_few_patches_fails() -> None:
     world = make_world((default_camera(160, 120),))
     world.scenes.short_side = 16  # two rows of two patches
-    estimate = NetworkLocalizer(world.scenes).localize(world.view(0))
+    estimate = world.localize(world.view(0))
     assert (estimate.status, estimate.reason) == ("failed", "fewer than 6 inliers")
     assert (estimate.inliers, estimate.inlier_ratio) == (0, 0.0)
 
@@ -107,17 +101,16 @@ def test_scenes_have_their_own_threshold() -> None:
     world = make_world(threshold=0.5)
     low = world.view(0, correct=0.35)
     high = world.view(0, correct=0.75)
-    localizer = NetworkLocalizer(world.scenes)
-    assert localizer.localize(high).status == "ok"
-    estimate = localizer.localize(low)
+    assert world.localize(high).status == "ok"
+    estimate = world.localize(low)
     assert (estimate.status, estimate.base_from_camera) == ("unknown_scene", None)
     assert estimate.inlier_ratio == pytest.approx(0.35, abs=0.03)
     assert "scene-0 needs 50 %" in estimate.reason
-    every = NetworkLocalizer(world.scenes, NetworkLocalizeOptions(refuses=False))
-    assert every.localize(low).status == "ok"
+    every = NetworkLocalizeOptions(refuses=False)
+    assert world.localize(low, options=every).status == "ok"
     records = world.scenes.scenes
     records[0] = replace(records[0], inlier_threshold=0.25)
-    assert NetworkLocalizer(world.scenes).localize(low).status == "ok"
+    assert world.localize(low).status == "ok"
 
 
 def test_covariance_has_the_scale_of_its_scene() -> None:
@@ -125,7 +118,7 @@ def test_covariance_has_the_scale_of_its_scene() -> None:
     for scale in (1.0, 7.0):
         world = make_world()
         world.scenes.scenes[0] = replace(world.scenes.scenes[0], covariance_scale=scale)
-        estimate = NetworkLocalizer(world.scenes).localize(world.view(0))
+        estimate = world.localize(world.view(0))
         assert estimate.covariance is not None
         covariances.append(estimate.covariance)
     np.testing.assert_allclose(covariances[1], 7 * covariances[0], rtol=1e-9)
@@ -140,7 +133,7 @@ def test_candidates_are_chosen_by_prototypes() -> None:
     ) -> list[int]:
         world.describe(image, descriptor)
         world.head.scenes_asked.clear()
-        NetworkLocalizer(world.scenes, options).localize(image)
+        world.localize(image, options=options)
         return list(world.head.scenes_asked)
 
     options = NetworkLocalizeOptions
@@ -166,25 +159,22 @@ def test_candidate_with_the_most_support_wins() -> None:
     world = make_world((CAMERA,) * 3)
     image = world.view(2)
     world.describe(image, [1.0, 0.9, 0.95, 0])  # most similar to scene 0
-    world.assert_located(
-        NetworkLocalizer(world.scenes).localize(image), image, "scene-2"
-    )
+    world.assert_located(image, 2)
     assert world.head.scenes_asked == [0, 2, 1]
-    one = NetworkLocalizer(world.scenes, NetworkLocalizeOptions(candidates=1))
-    assert one.localize(image).inlier_ratio < 0.1
+    one = NetworkLocalizeOptions(candidates=1)
+    assert world.localize(image, options=one).inlier_ratio < 0.1
 
 
 def test_descriptor_conditioned_head_runs_once_and_the_cell_decides_the_scene() -> None:
     world = make_world((CAMERA,) * 3, condition="descriptor")
-    localizer = NetworkLocalizer(world.scenes)
     for scene in (2, 0, 1):
         image = world.view(scene)
         world.head.scenes_asked.clear()
-        world.assert_located(localizer.localize(image), image, f"scene-{scene}")
+        world.assert_located(image, scene)
         assert len(world.head.scenes_asked) == 1
     image = world.view(1)
     world.head.points[1, int(image[0, 0, 0])] += 500.0  # outside all cells
-    estimate = localizer.localize(image)
+    estimate = world.localize(image)
     assert estimate.status == "failed"
     assert "cell" in estimate.reason
 
@@ -193,8 +183,7 @@ def test_descriptor_conditioned_head_uses_the_camera_of_the_scene() -> None:
     world = make_world((CAMERA, WIDE), condition="descriptor")
     for scene, camera in enumerate((CAMERA, WIDE)):
         image = world.view(scene, camera)
-        estimate = NetworkLocalizer(world.scenes).localize(image)
-        world.assert_located(estimate, image, f"scene-{scene}")
+        world.assert_located(image, scene)
 
 
 def test_pose_moves_to_the_cell_of_another_camera_at_most_once() -> None:
@@ -216,7 +205,7 @@ def test_pose_moves_to_the_cell_of_another_camera_at_most_once() -> None:
         + rays[:, 1:2] * np.array([0, 0, -1.0])
     )
     world.head.points[0, int(image[0, 0, 0])] = torch.from_numpy(points).float()
-    estimate = NetworkLocalizer(world.scenes).localize(image)
+    estimate = world.localize(image)
     assert len(world.head.scenes_asked) == 2
     assert estimate.inlier_ratio > 0.9
     assert estimate.status == "failed"

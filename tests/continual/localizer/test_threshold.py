@@ -50,8 +50,7 @@ def frames(world: World, shares: np.ndarray) -> list[Frame]:
 
 
 def ratios(world: World, images: list[np.ndarray]) -> list[float]:
-    localizer = NetworkLocalizer(world.scenes)
-    return [localizer.localize(image).inlier_ratio for image in images]
+    return [world.localize(image).inlier_ratio for image in images]
 
 
 def test_threshold_lies_a_sixth_above_the_negatives(world: World, fit: Fit) -> None:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer
 from evercal.continual.networks.atlas import Atlas
 from evercal.continual.networks.descriptor import GlobalDescriptor
 from evercal.continual.networks.head import Head, HeadOptions, HeadOutput
@@ -24,6 +25,7 @@ from evercal.localization.estimate import PoseEstimate
 from evercal.simulation.box_room import BoxRoom, default_camera
 
 from ...encoders import BlockMean
+from ..draws import normal
 
 SHORT_SIDE = 120
 CAMERA = default_camera(160, 120)
@@ -71,9 +73,7 @@ class ExactHead(Head):
             if key[0] == scene or not coded
         }
         levels = (255 * features[:, 0]).round().int().tolist()
-        noise = (
-            torch.randn(len(levels), 3, generator=torch.Generator().manual_seed(0)) * 3
-        )
+        noise = normal(len(levels), 3) * 3
         rows = [
             points[level][i] if level in points and i < len(points[level]) else noise[i]
             for i, level in enumerate(levels)
@@ -140,15 +140,27 @@ class World:
         descriptors = cast(LevelDescriptor, self.scenes.descriptor).descriptors
         descriptors[int(image[0, 0, 0])] = descriptor
 
+    def localize(
+        self,
+        image: np.ndarray,
+        camera: Camera | None = None,
+        options: NetworkLocalizeOptions | None = None,
+    ) -> PoseEstimate:
+        """Localize an image in the scenes as they are."""
+        return NetworkLocalizer(self.scenes, options).localize(image, camera)
+
     def assert_located(
-        self, estimate: PoseEstimate, image: np.ndarray, scene: str
-    ) -> None:
-        """Assert that an estimate is the true pose in a scene."""
-        assert (estimate.status, estimate.reason, estimate.scene) == ("ok", "", scene)
+        self, image: np.ndarray, scene: int, camera: Camera | None = None
+    ) -> PoseEstimate:
+        """Assert that an image is localized at its true pose in a scene."""
+        estimate = self.localize(image, camera)
+        name = f"scene-{scene}"
+        assert (estimate.status, estimate.reason, estimate.scene) == ("ok", "", name)
         assert estimate.base_from_camera is not None
         metres, radians = pose_distance(estimate.base_from_camera, self.pose(image))
         assert metres < 1e-4
         assert radians < 1e-4
+        return estimate
 
 
 def patch_centres(camera: Camera) -> np.ndarray:

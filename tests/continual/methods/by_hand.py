@@ -1,15 +1,22 @@
 """Rows, outputs and scenes for calculations by hand."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from evercal.continual.methods.method import MethodState, StageStart
+from evercal.continual.methods.penalties import Penalty
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
 from evercal.continual.networks.head import Head, HeadOptions, HeadOutput, fresh_head
 from evercal.continual.networks.loss import Target
 from evercal.geometry import SE3
 
+from ..draws import seeded
+
+Cost = Callable[[HeadOutput, Rows], Tensor]
 DEPTH_M = 2.0
 FOCAL_PX = 100.0
 
@@ -34,10 +41,13 @@ def head_output(
     points: list[list[float]], hidden: list[list[float]] | None = None
 ) -> HeadOutput:
     """Create a head's output with given points (camera frame, metres)."""
-    where = torch.tensor(points, requires_grad=True)
     zero = torch.zeros(len(points), 2)
-    activations = zero if hidden is None else torch.tensor(hidden)
-    return HeadOutput(zero, torch.zeros(len(points), 1, 3), where, activations)
+    return HeadOutput(
+        zero,
+        torch.zeros(len(points), 1, 3),
+        torch.tensor(points, requires_grad=True),
+        torch.tensor(hidden or zero.tolist()),
+    )
 
 
 def wave_buffer(
@@ -48,7 +58,7 @@ def wave_buffer(
     So two scenes whose pixels differ by `shift_px` contradict one another. With `few`, a view shows
     so many different points only.
     """
-    generator = torch.Generator().manual_seed(100)
+    generator = seeded(100)
     points = torch.randn(50 * views, 3, generator=generator) + torch.tensor([0.0, 0, 4])
     points[:, 2].clamp_(min=2.0)
     if few:
@@ -80,15 +90,19 @@ def wave_head(scenes: int, options: HeadOptions | None = None) -> Head:
     return head
 
 
-def head_at_cameras(buffers: list[FeatureBuffer]) -> Head:
-    """Create a head for scenes of `learnable`, with centres at three cameras of each."""
-    head = fresh_head(48, 6, HeadOptions(width=32), seed=0)
-    for buffer in buffers:
-        matrix = buffer.tensors["camera_from_atlas"][:3].double()
-        head.grow(
-            (-matrix[:, :, :3].mT @ matrix[:, :, 3:])[..., 0].float(), seed=buffer.scene
-        )
-    return head
+@dataclass(frozen=True)
+class Given(Penalty):
+    """A given loss of the output for replayed rows."""
+
+    loss: Cost
+    needs_teacher = False
+
+    def __call__(
+        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
+    ) -> Tensor:
+        """Compute the loss."""
+        assert teacher is None
+        return self.loss(student, rows)
 
 
 def stage_start(

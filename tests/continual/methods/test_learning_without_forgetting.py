@@ -12,6 +12,7 @@ from evercal.continual.networks.buffer import join
 from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
 
+from ..draws import seeded
 from .by_hand import stage_start, wave_buffer, wave_head
 
 
@@ -24,8 +25,8 @@ def grown(scenes: int) -> tuple[Head, Head]:
 
 
 def calls(hooks: TrainingHooks, scene: int = 9):
-    fresh = wave_buffer(scene).draw(32, torch.Generator().manual_seed(0))
-    return fresh, hooks.replayed(fresh, 0, 1e-3, torch.Generator().manual_seed(1))
+    fresh = wave_buffer(scene).draw(32, seeded(0))
+    return fresh, hooks.replayed(fresh, 0, 1e-3, seeded(1))
 
 
 @pytest.mark.parametrize("scenes", [1, 2, 3])

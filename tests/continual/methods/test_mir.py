@@ -1,11 +1,9 @@
 """Maximally interfered retrieval selects harmed views and does not change the head."""
 
 import copy
-from collections.abc import Callable
 
 import pytest
 import torch
-from torch import Tensor
 
 from evercal.continual.methods.mir import MaximallyInterferedRetrieval
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
@@ -13,9 +11,10 @@ from evercal.continual.networks.head import Head
 from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 
-from .by_hand import head_at_cameras, stage_start
+from ..box_features import Learnable, head_at_cameras
+from ..draws import seeded
+from .by_hand import stage_start
 
-Learnable = Callable[..., tuple[FeatureBuffer, Tensor]]
 OPTIONS = FitOptions(iterations=20, batch=96, replay_batch=60)
 MIR = MaximallyInterferedRetrieval()
 
@@ -41,9 +40,7 @@ def test_views_contradicted_by_new_rows_are_selected(
     rows = buffer.rows(torch.nonzero(buffer.tensors["view"] == harmed)[:, 0])
     rows.target.pixels = rows.target.pixels + torch.tensor([6.0, 0.0])
     actual = [
-        MIR.interfered_views(
-            head, rows, buffer, 5e-4, torch.Generator().manual_seed(seed)
-        ).tolist()
+        MIR.interfered_views(head, rows, buffer, 5e-4, seeded(seed)).tolist()
         for seed in range(5)
     ]
     assert all(len(set(views)) == MIR.chosen for views in actual)

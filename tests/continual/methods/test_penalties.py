@@ -18,6 +18,7 @@ from evercal.continual.methods.penalties import (
 from evercal.continual.methods.spdd import SpddOptions, spdd_loss
 from evercal.continual.networks.head import HeadOutput
 
+from ..draws import seeded
 from .by_hand import DEPTH_M, head_output, off_by, rows
 
 PX_PER_M = 50.0
@@ -83,7 +84,7 @@ def test_relations_by_hand() -> None:
 @pytest.mark.parametrize("scene", [0, 3])
 def test_relations_cover_every_remembered_scene(scene: int) -> None:
     """Rows are ordered by scene, 700 of each; a change in any scene has a loss."""
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     activations = torch.randn(2800, 8, generator=generator)
     right = [off_by(0.0)] * 2800
     teacher = head_output(right, activations.tolist())
@@ -144,7 +145,7 @@ def output(centres: int, generator: torch.Generator) -> HeadOutput:
 
 
 def test_distillation_is_spdd_with_a_scale() -> None:
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     teacher = output(6, generator)
     student = output(8, generator)
     expected = float(spdd_loss(student, teacher, SpddOptions()).total)

@@ -1,55 +1,24 @@
 """Preconditioned steps: the formula, fixed parameters, less drift."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.methods.penalties import Penalty
 from evercal.continual.methods.preconditioning import PreconditionedReplay, owned_rows
-from evercal.continual.networks.buffer import FeatureBuffer, Rows
-from evercal.continual.networks.head import Head, HeadOptions, HeadOutput
+from evercal.continual.networks.buffer import FeatureBuffer
+from evercal.continual.networks.head import Head, HeadOptions
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer
 
-from .by_hand import head_at_cameras, stage_start, wave_buffer, wave_head
+from ..box_features import Learnable, head_at_cameras
+from ..draws import normal
+from .by_hand import Cost, Given, stage_start, wave_buffer, wave_head
 
-Learnable = Callable[..., tuple[FeatureBuffer, Tensor]]
 OPTIONS = FitOptions(iterations=30, batch=128, replay_batch=128)
 
 
-@dataclass(frozen=True)
-class Free(Penalty):
-    """No loss on replayed rows."""
-
-    needs_teacher = False
-
-    def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
-    ) -> Tensor:
-        """Return zero."""
-        return torch.zeros(())
-
-
-@dataclass(frozen=True)
-class Short(Penalty):
-    """The mean length of points, which depends on all parameters."""
-
-    needs_teacher = False
-
-    def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
-    ) -> Tensor:
-        """Compute the mean."""
-        return student.points.abs().mean()
-
-
-def hooks_for(
-    head: Head, memories: list[FeatureBuffer], penalty: Penalty, strength: float
-):
-    method = PreconditionedReplay(penalty=penalty, strength=strength)
+def hooks_for(head: Head, memories: list[FeatureBuffer], cost: Cost, strength: float):
+    method = PreconditionedReplay(penalty=Given(cost), strength=strength)
     return method.begin(stage_start(head, memories, replay_rows=128))
 
 
@@ -71,13 +40,13 @@ def test_changes_are_damped_by_the_formula(learnable: Learnable, scenes: int) ->
     first = head.first[0]
     assert isinstance(first, torch.nn.Linear)
     hook = first.register_forward_hook(lambda _, inputs, __: captured.append(inputs[0]))
-    hooks = hooks_for(head, buffers, Free(), strength)
+    hooks = hooks_for(head, buffers, lambda *_: torch.zeros(()), strength)
     hook.remove()
     moments = [x.double().T @ x.double() / len(x) for x in captured]
     assert len(moments) == scenes
     moment = torch.stack([m / m.diagonal().mean() for m in moments]).sum(0)
     expected = torch.linalg.inv(torch.eye(48) + strength * moment)
-    change = torch.randn(32, 48, generator=torch.Generator().manual_seed(2))
+    change = normal(32, 48, seed=2)
     bias = torch.ones(32)
     actual = edited(
         hooks, head, {"first.0.weight": change.clone(), "first.0.bias": bias.clone()}
@@ -103,7 +72,10 @@ def test_parameters_of_remembered_scenes_are_fixed(
     buffers = [learnable(scene)[0] for scene in range(3)]
     head = head_at_cameras(buffers)
     before = {name: value.clone() for name, value in head.state_dict().items()}
-    hooks = hooks_for(head, buffers[:2], Short(), strength)
+    # The mean length of points depends on all parameters.
+    hooks = hooks_for(
+        head, buffers[:2], lambda output, _: output.points.abs().mean(), strength
+    )
     list(HeadTrainer(head, buffers[2:], OPTIONS, 0, hooks).run())
     after = head.state_dict()
     own = {"code": torch.tensor([True, True, False])}

@@ -1,44 +1,35 @@
 """Replay: division of rows, weights, and stored points."""
 
 import copy
-from dataclasses import dataclass
 
 import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.methods.penalties import OldOutput, Penalty, Reprojection
+from evercal.continual.methods.penalties import OldOutput, Reprojection
 from evercal.continual.methods.replay import Replay, ReplayHooks
 from evercal.continual.networks.buffer import Rows, join
 from evercal.continual.networks.head import HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
 
-from .by_hand import head_output, off_by, stage_start, wave_buffer, wave_head
+from ..draws import seeded
+from .by_hand import Given, head_output, off_by, stage_start, wave_buffer, wave_head
 
 
-@dataclass(frozen=True)
-class OneEach(Penalty):
+def one_each(output: HeadOutput, rows: Rows) -> Tensor:
     """A constant loss of one per row."""
-
-    needs_teacher = False
-
-    def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
-    ) -> Tensor:
-        """Return one."""
-        assert teacher is None
-        return torch.ones(len(rows.scene)).mean()
+    return torch.ones(len(rows.scene)).mean()
 
 
 def drawn(hooks: TrainingHooks, step: int = 0) -> list[Rows]:
-    fresh = wave_buffer(9).draw(8, torch.Generator().manual_seed(0))
-    return hooks.replayed(fresh, step, 1e-3, torch.Generator().manual_seed(step))
+    fresh = wave_buffer(9).draw(8, seeded(0))
+    return hooks.replayed(fresh, step, 1e-3, seeded(step))
 
 
 @pytest.mark.parametrize("scenes", [1, 2, 3, 6])
 @pytest.mark.parametrize("every_scene", [True, False])
 def test_weight_applies_per_scene_or_in_total(scenes: int, every_scene: bool) -> None:
-    method = Replay(penalty=OneEach(), weight=0.3, every_scene=every_scene)
+    method = Replay(penalty=Given(one_each), weight=0.3, every_scene=every_scene)
     memories = [wave_buffer(i) for i in range(scenes)]
     hooks = method.begin(stage_start(wave_head(scenes + 1), memories))
     replayed = join(drawn(hooks))

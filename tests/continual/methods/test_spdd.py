@@ -9,6 +9,8 @@ from torch import Tensor
 from evercal.continual.methods.spdd import SpddOptions, spdd_loss
 from evercal.continual.networks.head import HeadOutput
 
+from ..draws import seeded
+
 INF = math.inf
 
 
@@ -21,7 +23,7 @@ def tensor(values):
 
 
 def random_output(rows, centres, seed, shared=False):
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
 
     def draw(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
@@ -61,59 +63,19 @@ def slow_terms(student, teacher, active, temperature):
     return prior / rows, metric / rows, float(output) / rows
 
 
-def two_rows():
-    """With M_a = 2, the active set is {0, 2} in the first row and {1, 3} in the second."""
-    teacher = head_output(
-        tensor([[2.0, -1.0, 1.0, 0.0], [0.0, 3.0, -2.0, 3.5]]),
-        tensor([[[0.0] * 3, [9.0] * 3, [1.0, 2.0, 3.0], [9.0] * 3]] * 2),
-        tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]),
-    )
-    student = head_output(
-        tensor([[1.0, 5.0, 1.0, 7.0], [8.0, 3.0, 4.0, 1.5]]),
-        tensor(
-            [
-                [[0.5, -0.25, 0.0], [0.0] * 3, [1.0, 2.0, 4.0], [0.0] * 3],
-                [[7.0] * 3, [9.0, 9.0, 8.0], [7.0] * 3, [9.0, 9.5, 9.0]],
-            ]
-        ),
-        tensor([[0.5, 0.0, -0.25], [1.0, 3.0, 1.0]]),
-    )
-    return student, teacher
-
-
-def test_two_rows_by_hand():
-    student, teacher = two_rows()
-    terms = spdd_loss(
-        student, teacher, SpddOptions(2.0, 3.0, 5.0, temperature=2.0, active_centres=2)
-    )
-    # Row 1: teacher logits 2, 1 over 2 -> sigmoid(0.5); student 1, 1 -> one half each.
-    p = 1 / (1 + math.exp(-0.5))
-    first = p * math.log(p / 0.5) + (1 - p) * math.log((1 - p) / 0.5)
-    # Row 2: teacher 3.5 against 3 -> sigmoid(0.25); student 1.5 against 3 -> sigmoid(-0.75).
-    p = 1 / (1 + math.exp(-0.25))
-    q = 1 / (1 + math.exp(0.75))
-    second = p * math.log(p / q) + (1 - p) * math.log((1 - p) / (1 - q))
-    prior = 4 * (first + second) / 2
-    metric = ((0.5 + 0.25 + 1.0) + (1.0 + 0.5)) / 2
-    output = ((0.5 + 0.25) + 2.0) / 2
-    assert terms.prior.item() == pytest.approx(prior, rel=1e-12)
-    assert terms.metric.item() == pytest.approx(metric, rel=1e-12)
-    assert terms.output.item() == pytest.approx(output, rel=1e-12)
-    assert terms.total.item() == pytest.approx(
-        2 * prior + 3 * metric + 5 * output, rel=1e-12
-    )
-
-
 @pytest.mark.parametrize("new", [0, 1, 5])
 @pytest.mark.parametrize(("active", "temperature"), [(1, 1.0), (3, 0.5), (50, 2.0)])
 def test_terms_match_a_slow_reference(new, active, temperature):
     teacher = random_output(6, 9, 0)
     student = random_output(6, 9 + new, 1)
-    options = SpddOptions(active_centres=active, temperature=temperature)
+    options = SpddOptions(2.0, 3.0, 5.0, temperature, active)
     terms = spdd_loss(student, teacher, options)
-    expected = slow_terms(student, teacher, active, temperature)
-    actual = terms.prior.item(), terms.metric.item(), terms.output.item()
-    assert actual == pytest.approx(expected, rel=1e-10)
+    prior, metric, output = slow_terms(student, teacher, active, temperature)
+    assert terms.prior.item() == pytest.approx(prior, rel=1e-10)
+    assert terms.metric.item() == pytest.approx(metric, rel=1e-10)
+    assert terms.output.item() == pytest.approx(output, rel=1e-10)
+    total = 2 * prior + 3 * metric + 5 * output
+    assert terms.total.item() == pytest.approx(total, rel=1e-10)
 
 
 def test_probability_of_a_new_centre_is_charged():
@@ -143,7 +105,8 @@ def test_probability_of_a_new_centre_is_charged():
 
 
 def test_shared_offsets():
-    student, teacher = two_rows()
+    student = random_output(2, 4, 0)
+    teacher = random_output(2, 4, 1)
     teacher.offsets = tensor([[[0.0, 1.0, 2.0]], [[3.0, 3.0, 3.0]]])
     student.offsets = tensor([[[0.5, 1.0, 0.0]], [[3.0, 2.0, 3.0]]])
     terms = spdd_loss(student, teacher, SpddOptions())
@@ -219,21 +182,7 @@ def test_at_most_fifty_centres_are_active(centres):
     teacher = random_output(3, centres, 22)
     student = random_output(3, centres, 23)
     student.offsets.requires_grad_()
-    terms = spdd_loss(student, teacher, SpddOptions())
-    actual = terms.prior.item(), terms.metric.item(), terms.output.item()
-    detached = head_output(student.logits, student.offsets.detach(), student.points)
-    assert actual == pytest.approx(
-        slow_terms(detached, teacher, 50, 2.0), rel=1e-10, abs=1e-12
-    )
-    terms.metric.backward()
+    spdd_loss(student, teacher, SpddOptions()).metric.backward()
     assert student.offsets.grad is not None
     active = (student.offsets.grad.abs().sum(2) > 0).sum(1)
     assert active.tolist() == [min(50, centres)] * 3
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"temperature": 0.0}, {"active_centres": 0}, {"prior_weight": -1.0}]
-)
-def test_invalid_options_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        SpddOptions(**wrong)

@@ -24,6 +24,8 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.frame import Frame
 from evercal.simulation.box_room import BoxRoom
 
+from ..draws import seeded
+
 LANDSCAPE = Camera(160, 120, 131.0, 128.0, 83.0, 57.0)
 CAMERAS = (
     LANDSCAPE,
@@ -195,21 +197,21 @@ def test_augmented_views_have_the_planned_number_of_valid_cells(
 
 def test_draws_are_reproducible_and_cover_the_buffer(filled: Filled) -> None:
     buffer = filled(replace(PLAN, views_per_frame=1))
-    seeded = torch.Generator().manual_seed(3)
-    first = buffer.draw(20_000, seeded)
-    again = buffer.draw(20_000, torch.Generator().manual_seed(3))
+    generator = seeded(3)
+    first = buffer.draw(20_000, generator)
+    again = buffer.draw(20_000, seeded(3))
     assert torch.equal(first.target.pixels, again.target.pixels)
     _, counts = torch.unique(first.target.pixels, dim=0, return_counts=True)
     every = torch.unique(buffer.tensors["pixels"], dim=0)
     assert len(counts) > 0.99 * len(every)
     assert not torch.equal(
-        buffer.draw(50, seeded).target.pixels, first.target.pixels[:50]
+        buffer.draw(50, generator).target.pixels, first.target.pixels[:50]
     )
 
 
 def test_part_and_join_are_inverse(filled: Filled) -> None:
     buffer = filled(replace(PLAN, views_per_frame=1))
-    rows = buffer.draw(30, torch.Generator().manual_seed(1))
+    rows = buffer.draw(30, seeded(1))
     again = join(
         [rows.part(slice(0, 7)), rows.part(slice(7, 8)), rows.part(slice(8, None))]
     )
@@ -220,7 +222,7 @@ def test_part_and_join_are_inverse(filled: Filled) -> None:
 
 
 def test_corrected_rows_follow_an_ideal_pinhole() -> None:
-    points = torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
+    points = torch.randn(60, 3, generator=seeded(0))
     points[:, 2] = points[:, 2].abs() + 3
     correction = torch.tensor([0.02, 0.01, -0.02, -0.12, 0.03])
     buffer = FeatureBuffer(0, SE3.identity())

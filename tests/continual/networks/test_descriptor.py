@@ -16,6 +16,8 @@ from evercal.continual.networks.descriptor import (
 from evercal.errors import InputError
 from evercal.features.encoder import load_encoder
 
+from ..draws import seeded
+
 
 def tiny() -> GlobalDescriptor:
     torch.manual_seed(0)
@@ -46,7 +48,7 @@ def by_hand(descriptor: GlobalDescriptor, features: np.ndarray) -> np.ndarray:
 
 def test_output_matches_a_slow_reference() -> None:
     descriptor = tiny()
-    features = torch.randn(2, 5, 3, 4, generator=torch.Generator().manual_seed(1))
+    features = torch.randn(2, 5, 3, 4, generator=seeded(1))
     with torch.no_grad():
         actual = descriptor(features)
     for vector, image in zip(actual, features, strict=True):

@@ -11,6 +11,8 @@ from evercal.continual.networks.head import Head, HeadOptions, fresh_head
 from evercal.continual.networks.loss import LossOptions, reprojection_loss
 from evercal.geometry import SE3
 
+from ..draws import normal, seeded
+
 SHAPES = [
     HeadOptions(width=12, condition="code", offsets="per_centre"),
     HeadOptions(width=12, condition="code", offsets="shared"),
@@ -21,44 +23,38 @@ SHAPES = [
 CPU = torch.device("cpu")
 
 
-def random(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(
-        *shape, generator=torch.Generator().manual_seed(seed), device="cpu"
-    )
-
-
 def head_of(options: HeadOptions, device: torch.device) -> Head:
     """Create a head for three scenes that was moved before growth and whitening."""
     head = fresh_head(7, 4, options, seed=5).to(device)
     for scene in range(3):
-        head.grow(3 * random(2, 3, seed=scene), seed=scene)
-    head.whiten((random(60, 7, seed=9) + 1).to(device))
+        head.grow(3 * normal(2, 3, seed=scene), seed=scene)
+    head.whiten((normal(60, 7, seed=9) + 1).to(device))
     return head
 
 
 def buffer_of(device: torch.device, scene: int = 1) -> FeatureBuffer:
     """Create forty rows of two views with known points."""
     buffer = FeatureBuffer(scene, SE3.identity(), device=device)
-    matrix = torch.eye(4, device="cpu")[None, :3] + 0.1 * random(2, 3, 4, seed=2)
+    matrix = torch.eye(4, device="cpu")[None, :3] + 0.1 * normal(2, 3, 4, seed=2)
     matrix[:, 2, 3] += 8  # most points are in front of the camera
     buffer.extend(
         {
-            "features": random(40, 7).half(),
-            "pixels": 20 * random(40, 2, seed=1) + 50,
+            "features": normal(40, 7).half(),
+            "pixels": 20 * normal(40, 2, seed=1) + 50,
             "view": torch.arange(2, dtype=torch.int32, device="cpu").repeat_interleave(
                 20
             ),
             "intrinsics": torch.tensor([[100.0, 100, 50, 50]] * 2, device="cpu"),
             "camera_from_atlas": matrix,
-            "descriptors": torch.nn.functional.normalize(random(2, 4, seed=3)),
+            "descriptors": torch.nn.functional.normalize(normal(2, 4, seed=3)),
         }
     )
-    buffer.known = random(40, 3, seed=4).half().to(device)
+    buffer.known = normal(40, 3, seed=4).half().to(device)
     return buffer
 
 
 def drawn(buffers: list[FeatureBuffer]) -> Rows:
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     plain = buffer_of(buffers[0].device)
     plain.known = None
     return join(

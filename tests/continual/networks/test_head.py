@@ -16,23 +16,21 @@ from evercal.continual.networks.head import (
 )
 from evercal.errors import InputError
 
+from ..draws import normal
+
 FEATURES = 7
 DESCRIPTOR = 5
 CENTRES = 3
 
 
-def random(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
-
-
 def grown(options: HeadOptions, scenes: int, features: int = FEATURES) -> Head:
     head = fresh_head(features, DESCRIPTOR, options, seed=5)
     for scene in range(scenes):
-        head.grow(4 * random(CENTRES, 3, seed=scene), seed=scene)
+        head.grow(4 * normal(CENTRES, 3, seed=scene), seed=scene)
     with torch.no_grad():  # a new scene's biases are zero; a trained head's are not
-        head.logit_bias.copy_(random(*head.logit_bias.shape, seed=8))
-        head.offset_bias.copy_(random(*head.offset_bias.shape, seed=9))
-    head.whiten(random(50, features, seed=7) * torch.linspace(0.1, 3, features) + 1)
+        head.logit_bias.copy_(normal(*head.logit_bias.shape, seed=8))
+        head.offset_bias.copy_(normal(*head.offset_bias.shape, seed=9))
+    head.whiten(normal(50, features, seed=7) * torch.linspace(0.1, 3, features) + 1)
     return head.eval()
 
 
@@ -48,8 +46,8 @@ CODED = [shape for shape in SHAPES if shape.condition == "code"]
 
 
 def test_whitening_centres_scales_and_half_decorrelates() -> None:
-    mixing = random(FEATURES, FEATURES, seed=3)
-    rows = random(4000, FEATURES, seed=4) @ mixing + 5
+    mixing = normal(FEATURES, FEATURES, seed=3)
+    rows = normal(4000, FEATURES, seed=4) @ mixing + 5
     head = Head(FEATURES, DESCRIPTOR, HeadOptions(width=12))
     head.whiten(rows)
     white = ((rows - head.feature_mean) @ head.feature_map).double()
@@ -67,7 +65,7 @@ def test_whitening_centres_scales_and_half_decorrelates() -> None:
 
 
 def test_whitening_does_not_amplify_constant_directions() -> None:
-    rows = random(500, FEATURES, seed=4)
+    rows = normal(500, FEATURES, seed=4)
     rows[:, 0] = 2.0
     head = Head(FEATURES, DESCRIPTOR, HeadOptions(width=12))
     head.whiten(rows)
@@ -137,8 +135,8 @@ def by_hand(
 @pytest.mark.parametrize("options", SHAPES)
 def test_points_match_a_slow_reference(options: HeadOptions) -> None:
     head = grown(options, 3)
-    features = random(9, FEATURES, seed=1)
-    descriptors = random(9, DESCRIPTOR, seed=2)
+    features = normal(9, FEATURES, seed=1)
+    descriptors = normal(9, DESCRIPTOR, seed=2)
     scene = torch.arange(9) % 3
     with torch.no_grad():
         points = head(features, scene, descriptors).points.numpy()
@@ -155,13 +153,13 @@ def test_new_scenes_do_not_change_the_output_for_old_scenes(
     options: HeadOptions, rows: int
 ) -> None:
     head = grown(options, 2)
-    features = random(rows, FEATURES, seed=1)
+    features = normal(rows, FEATURES, seed=1)
     mixed = torch.arange(rows) % 2
     with torch.no_grad():
         before = [head(features, scene, None).points for scene in (0, 1)]
         together = head(features, mixed, None).points
         for more in range(3):
-            head.grow(20 * random(CENTRES + more, 3, seed=more), seed=more)
+            head.grow(20 * normal(CENTRES + more, 3, seed=more), seed=more)
             for scene in (0, 1):
                 assert torch.equal(head(features, scene, None).points, before[scene])
             # With rows of several scenes, rounding depends on the number of centres.
@@ -175,7 +173,7 @@ def test_new_scenes_do_not_change_the_output_for_old_scenes(
 @pytest.mark.parametrize("options", CODED)
 def test_scene_index_and_scene_tensor_agree(options: HeadOptions) -> None:
     head = grown(options, 3)
-    features = random(50, FEATURES, seed=1)
+    features = normal(50, FEATURES, seed=1)
     for scene in range(3):
         own = head.centre_scene == scene
         with torch.no_grad():
@@ -189,9 +187,9 @@ def test_scene_index_and_scene_tensor_agree(options: HeadOptions) -> None:
 
 def test_with_a_descriptor_the_scene_index_is_ignored() -> None:
     head = grown(SHAPES[3], 3)
-    features = random(30, FEATURES, seed=1)
-    first = random(30, DESCRIPTOR, seed=2)
-    second = random(30, DESCRIPTOR, seed=3)
+    features = normal(30, FEATURES, seed=1)
+    first = normal(30, DESCRIPTOR, seed=2)
+    second = normal(30, DESCRIPTOR, seed=3)
     with torch.no_grad():
         points = head(features, 0, first).points
         assert torch.equal(head(features, 2, first).points, points)
@@ -203,7 +201,7 @@ def test_with_a_descriptor_the_scene_index_is_ignored() -> None:
 def test_centres_are_added_in_fp32_under_autocast() -> None:
     """At 5 km the resolution of bfloat16 is 32 m, so only the offset may be in bfloat16."""
     head = grown(SHAPES[0], 1)
-    features = random(30, FEATURES, seed=1)
+    features = normal(30, FEATURES, seed=1)
     head.centres += torch.tensor([5000.0, 0.0, 0.0])
     with torch.no_grad():
         exact = head(features, 0, None).points
@@ -218,10 +216,10 @@ def test_centres_are_added_in_fp32_under_autocast() -> None:
 def test_fixed_centres_need_the_descriptor() -> None:
     options = HeadOptions(width=8, condition="descriptor", centres="fixed")
     head = Head(FEATURES, DESCRIPTOR, options)
-    head.grow(random(6, 3), 0)
+    head.grow(normal(6, 3), 0)
     head.grow(torch.zeros(0, 3), 1)
     assert head.centres.shape == (6, 3)
-    points = head(random(4, FEATURES), 1, random(4, DESCRIPTOR)).points
+    points = head(normal(4, FEATURES), 1, normal(4, DESCRIPTOR)).points
     assert torch.isfinite(points).all()
     with pytest.raises(InputError, match="condition 'code'"):
         Head(FEATURES, DESCRIPTOR, replace(options, condition="code"))

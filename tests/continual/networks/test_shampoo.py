@@ -12,14 +12,16 @@ from evercal.continual.networks.shampoo import (
     inverse_root,
 )
 
+from ..draws import seeded
+
 
 def _gradients(steps: int, width: int = 24) -> list[torch.Tensor]:
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     return [torch.randn(width, width, generator=generator) for _ in range(steps)]
 
 
 def test_inverse_root_inverts_the_square() -> None:
-    a = torch.randn(2, 60, 16, generator=torch.Generator().manual_seed(1))
+    a = torch.randn(2, 60, 16, generator=seeded(1))
     moment = a.mT @ a
     root = inverse_root(moment)
     mean = moment.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
@@ -33,7 +35,7 @@ def test_inverse_root_inverts_the_square() -> None:
 def test_double_precision_is_tried_if_single_fails(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    a = torch.randn(2, 60, 16, generator=torch.Generator().manual_seed(1))
+    a = torch.randn(2, 60, 16, generator=seeded(1))
     expected = inverse_root(a.mT @ a)
     eigh = torch.linalg.eigh
 

@@ -9,17 +9,16 @@ import torch
 from torch import Tensor
 
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
-from evercal.continual.networks.head import Head, HeadOptions, HeadOutput, fresh_head
+from evercal.continual.networks.head import HeadOptions, HeadOutput
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
 from evercal.continual.networks.loss import LossOptions, clamp_px, reprojection_error
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer, one_cycle
 from evercal.features.views import cell_centres
-from evercal.geometry import SE3, Camera
 
-CAMERA = Camera(160, 120, 131.0, 128.0, 79.5, 59.5)
-CHANNELS = 48
-DESCRIPTOR = 6
-ATLAS_FROM_BASE = SE3.exp([5.0, -5.0, 0.0, 0.0, 0.0, 0.7])
+from ..box_features import CAMERA, Learnable, head_at_cameras
+from ..draws import seeded
+from ..stages import weights
+
 OPTIONS = FitOptions(
     iterations=20,
     batch=96,
@@ -28,7 +27,6 @@ OPTIONS = FitOptions(
     loss=LossOptions(schedule="circle", clamp_start_px=25.0, clamp_end_px=1.0),
 )
 
-Learnable = Callable[..., tuple[FeatureBuffer, Tensor]]
 Cost = Callable[[HeadOutput, Rows, float], Tensor]
 
 
@@ -46,18 +44,6 @@ class Replayed(TrainingHooks):
 
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
         return self.penalty(output, rows, tau_px)
-
-
-def head_for(buffers: list[FeatureBuffer], options: HeadOptions | None = None) -> Head:
-    head = fresh_head(CHANNELS, DESCRIPTOR, options or HeadOptions(width=32), seed=0)
-    for buffer in buffers:
-        matrix = buffer.tensors["camera_from_atlas"].double().numpy()
-        atlas_from_camera = SE3.from_matrix(matrix).inverse()
-        head.grow(
-            torch.from_numpy(atlas_from_camera.translation_m[:3]).float(),
-            seed=buffer.scene,
-        )
-    return head
 
 
 @pytest.mark.parametrize(("iterations", "warm"), [(100, 0.05), (1000, 0.3), (40, 0.5)])
@@ -88,7 +74,7 @@ def test_replay_cost_is_minimised_on_even_shares(learnable: Learnable) -> None:
     buffers = [learnable(scene)[0] for scene in range(3)]
     captured: list[tuple[Tensor, float]] = []
     # This loss, which new rows do not have, moves the logits of scene 0 to -3.
-    head = head_for(buffers)
+    head = head_at_cameras(buffers)
 
     def penalty(output: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
         assert len(output.points) == len(rows.scene) == len(rows.features)
@@ -97,7 +83,7 @@ def test_replay_cost_is_minimised_on_even_shares(learnable: Learnable) -> None:
         return 100 * (own + 3).square().mean()
 
     def mean_logit() -> float:
-        rows = buffers[0].draw(200, torch.Generator().manual_seed(0))
+        rows = buffers[0].draw(200, seeded(0))
         with torch.no_grad():
             return float(head(rows.features.float(), 0, None).logits.mean())
 
@@ -117,7 +103,7 @@ def test_replay_cost_is_minimised_on_even_shares(learnable: Learnable) -> None:
 def test_descriptor_noise_has_the_stated_size(learnable: Learnable) -> None:
     buffer, _ = learnable()
     selected = buffer.tensors["descriptors"].clone()
-    head = head_for([buffer], HeadOptions(width=16, condition="descriptor"))
+    head = head_at_cameras([buffer], HeadOptions(width=16, condition="descriptor"))
     captured = []
     head.register_forward_pre_hook(lambda _, inputs: captured.append(inputs[2]))
     options = replace(OPTIONS, iterations=1, batch=4000, diffusion=0.5)
@@ -125,9 +111,9 @@ def test_descriptor_noise_has_the_stated_size(learnable: Learnable) -> None:
     (shaken,) = captured
     assert torch.equal(buffer.tensors["descriptors"], selected)
     torch.testing.assert_close(shaken.norm(dim=-1), torch.ones(4000))
-    rows = buffer.draw(4000, torch.Generator().manual_seed(0))
+    rows = buffer.draw(4000, seeded(0))
     cosine = (shaken * rows.descriptor.float()).sum(-1)
-    noise = torch.randn(200_000, DESCRIPTOR) * 0.5
+    noise = torch.randn(200_000, 6) * 0.5
     noise[:, 0] += 1  # an arbitrary direction
     expected = float((noise[:, 0] / noise.norm(dim=-1)).mean())
     assert float(cosine.mean()) == pytest.approx(expected, abs=0.02)
@@ -144,7 +130,7 @@ def test_wrong_intrinsics_are_corrected_if_allowed(learnable: Learnable) -> None
     rays = torch.from_numpy(true.unproject(cell_centres(120, 160, 8))).float()
     for correctable, steps in ((True, 250), (False, 20)):
         buffer, _ = learnable(views=20, lens=true, correctable=correctable)
-        head = head_for([buffer], HeadOptions(width=64))
+        head = head_at_cameras([buffer], HeadOptions(width=64))
         trainer = HeadTrainer(head, [buffer], replace(options, iterations=steps), 0)
         list(trainer.run())
         # Error of the intrinsics alone, at the identity pose.
@@ -185,13 +171,12 @@ def test_proposed_changes_sum_to_the_change_of_the_weights(
 ) -> None:
     """Holds for AdamW with decay and Shampoo with momentum."""
     buffers = [learnable(scene)[0] for scene in range(3)]
-    head = head_for(buffers)
-    first = {name: value.detach().clone() for name, value in head.named_parameters()}
+    head = head_at_cameras(buffers)
+    first = weights(head)
     hooks = StepRecorder(
         buffers[:2], lambda output, rows, tau_px: output.points.abs().mean()
     )
     list(HeadTrainer(head, buffers[2:], OPTIONS, 0, hooks).run())
-    assert hooks.distance.keys() == first.keys()
     for name, value in head.named_parameters():
         moved = value.detach().double() - first[name].double()
         torch.testing.assert_close(hooks.distance[name], moved, rtol=0, atol=2e-6)
@@ -209,8 +194,8 @@ def test_constraints_are_not_minimised(learnable: Learnable) -> None:
     def nothing(output: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
         return 0 * output.points.sum()
 
-    watched = head_for(buffers)
-    plain = head_for(buffers)
+    watched = head_at_cameras(buffers)
+    plain = head_at_cameras(buffers)
     hooks = StepRecorder(buffers[:2], nothing)
     next(HeadTrainer(watched, buffers[2:], OPTIONS, 0, hooks).run())
     next(

@@ -14,6 +14,7 @@ from evercal.continual.selection.frame_statistics import PARTS, FrameStatistics
 from evercal.continual.strategies import STRATEGIES
 from evercal.geometry import SE3
 
+from ..draws import seeded
 from ..stages import EmptyScenes, Rooms, learn
 
 
@@ -75,7 +76,7 @@ def test_gradient_predicts_the_change_of_the_loss(
     candidates, head, buffer = captured
     gradient = candidates.gradients()[0]
     own = torch.nonzero(buffer.tensors["view"] == 0)[:, 0]
-    drawn = torch.randint(len(own), (256,), generator=torch.Generator().manual_seed(5))
+    drawn = torch.randint(len(own), (256,), generator=seeded(5))
     rows = buffer.rows(own[drawn])
 
     def loss() -> float:

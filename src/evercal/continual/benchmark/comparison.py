@@ -217,7 +217,7 @@ def formatted(table: Table) -> Table:
 
 def summary(results: Table) -> dict[str, list[dict[str, object]]]:
     """Summarize every complete run for JSON, by strategy; NaN becomes None."""
-    strategies: dict[str, list[dict[str, object]]] = {}
+    strategies = {}
     for name, seed, run in _runs(results):
         last = last_stage(run).iloc[0]
         coarse = matrix(run)

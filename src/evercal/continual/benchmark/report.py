@@ -71,7 +71,7 @@ def write_report(folder: Path, reference: str) -> str:
 
 def _figure(results: Table, strategies: Table, path: Path) -> None:
     """Plot the accuracy on each scene while later ones are learned, means over runs."""
-    runs: dict[str, list[Table]] = {}
+    runs = {}
     for name in strategies:
         of_strategy = results[results["strategy"] == name]
         runs[name] = [comparison.matrix(run) for _, run in of_strategy.groupby("seed")]

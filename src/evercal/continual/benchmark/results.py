@@ -83,7 +83,7 @@ def scene_row(frames: Sequence[metrics.FrameResult]) -> dict[str, object]:
     squared = np.array([frame.squared_mahalanobis for frame in frames])
     wrong = np.array([frame.wrong_scene for frame in frames])
     middle = len(frames) // 2  # a mean of the two middle errors may include infinity
-    within: dict[str, int] = {}
+    within = {}
     for name, (most_m, most_rad) in WITHIN.items():
         within[name] = int(((metres < most_m) & (radians < most_rad)).sum())
     return {

@@ -52,7 +52,7 @@ def learn(
     head = after.heads[-1]
     if teacher is None:
         _whiten(head, [buffer], options.seed)
-    memories: list[FeatureBuffer] = []
+    memories = []
     if method.replays:
         memories = rows.remembered()
     start = StageStart(
@@ -88,7 +88,7 @@ def learn_jointly(
     fit = options.fit
     encoder = StageRows(after, options, on_event)
     atlas = after.atlas(options.grid_scenes)
-    buffers: list[FeatureBuffer] = []
+    buffers = []
     for recording in recordings:
         _, buffer = _begun(encoder, atlas, recording)
         buffers.append(buffer)
@@ -187,7 +187,7 @@ def finish_scene(
     selected = method.select(statistics, capacity)
     keyframes = None
     if selected is not None:
-        chosen: list[Frame] = []
+        chosen = []
         refined = scenes.scenes[-1].refined_camera
         for i in selected:
             # Replay uses the camera as training corrected it.

@@ -52,7 +52,7 @@ class StageRows:
 
     def remembered(self) -> list[FeatureBuffer]:
         """Encode the keyframes of all scenes that have some: one buffer per scene."""
-        buffers: list[FeatureBuffer] = []
+        buffers = []
         for number, keyframes in enumerate(self.scenes.keyframes):
             if keyframes:
                 buffers.append(self.of_keyframes(number))

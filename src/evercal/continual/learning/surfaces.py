@@ -45,8 +45,8 @@ def frame_depths(
     features = list(map(prepared.features, numbers))
     pairs = matched_pairs(prepared, encoder.vlad(features))
     prepared.depth_scale = depth_scale(prepared, pairs)
-    swept: list[Array] = []
-    sources: list[list[int]] = []
+    swept = []
+    sources = []
     for i in numbers:
         inverse, near = prepared.swept(i, SOURCE_VIEWS)
         swept.append(1 / inverse.astype(np.float64))

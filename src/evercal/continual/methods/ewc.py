@@ -38,7 +38,7 @@ class ElasticWeightConsolidation(Method):
     def after_scene(self, scene: FinishedScene) -> dict[str, Tensor]:
         """Return `anchor.NAME` and `importance.NAME` of every parameter, half precision."""
         importances = scaled_to_mean_one(fisher_information(scene, self.images))
-        state: dict[str, Tensor] = {}
+        state = {}
         for name, value in scene.head.named_parameters():
             state[f"anchor.{name}"] = _half(value.detach())
         for name, importance in importances.items():

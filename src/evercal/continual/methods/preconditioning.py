@@ -91,7 +91,7 @@ def input_moments(
 
     The mean of the diagonal is 1 per scene; the moments are double.
     """
-    moments: dict[str, Tensor] = {}
+    moments = {}
     handles = []
 
     def observe(name: str, layer: nn.Module) -> None:

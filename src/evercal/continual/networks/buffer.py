@@ -119,7 +119,7 @@ class FeatureBuffer:
         """All tensors by name, on the buffer's device."""
         if self._merged is not None:
             return self._merged
-        merged: dict[str, Tensor] = {}
+        merged = {}
         for name in self._parts[0]:
             columns = [part[name].cpu() for part in self._parts]
             merged[name] = torch.cat(columns).to(self.device)

@@ -223,10 +223,12 @@ class Head(nn.Module):
         bound = 1 / math.sqrt(width)
         self.code = _append(self.code, draw(1, self.layers, width, scale=0.2))
         self.logit = _append(self.logit, draw(count, width, scale=bound))
-        self.logit_bias = _append(self.logit_bias, torch.zeros(count))
+        self.logit_bias = _append(self.logit_bias, self.logit_bias.new_zeros(count))
         if self.options.offsets == "per_centre":
             self.offset = _append(self.offset, draw(count, 4, width, scale=bound))
-            self.offset_bias = _append(self.offset_bias, torch.zeros(count, 4))
+            self.offset_bias = _append(
+                self.offset_bias, self.offset_bias.new_zeros(count, 4)
+            )
         scene = torch.full((count,), self.scenes - 1, device=self.device)
         self.centres = torch.cat([self.centres, centres.to(self.centres)])
         self.centre_scene = torch.cat([self.centre_scene, scene])

@@ -225,9 +225,9 @@ class HeadTrainer:
 def _optimisers(
     head: Head, correction: torch.nn.Parameter, options: FitOptions
 ) -> list[torch.optim.Optimizer]:
-    hidden: list[torch.nn.Parameter] = []
-    decay: list[torch.nn.Parameter] = []
-    plain: list[torch.nn.Parameter] = []
+    hidden = []
+    decay = []
+    plain = []
     for name, parameter in head.named_parameters():
         if name.startswith(("code", "logit")):
             plain.append(parameter)

@@ -93,7 +93,7 @@ class FrameStatistics:
         """
         from scipy.cluster.vq import kmeans, vq
 
-        reliable: list[Array] = []
+        reliable = []
         for i in range(len(self)):
             rows = self._rows_of(i)
             points = self._points(self._hidden(rows))

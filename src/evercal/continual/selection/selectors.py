@@ -44,7 +44,7 @@ def select_herding(features: Array, capacity: int) -> IntArray:
     mean = unit.mean(0)
     free = np.ones(len(unit), dtype=bool)
     total = np.zeros(unit.shape[1])
-    selected: list[int] = []
+    selected = []
     for count in range(1, min(capacity, len(unit)) + 1):
         means = (total + unit) / count
         gap = np.linalg.norm(mean - means, axis=1)
@@ -96,7 +96,7 @@ def select_coverage(
     if not capacity:
         return _sorted([])
     shows = [set(parts.tolist()) for parts in visible]
-    selected: list[int] = []
+    selected = []
     for earlier, frame in enumerate(rng.permutation(len(visible)).tolist()):
         if len(selected) < capacity:
             selected.append(frame)
