@@ -53,15 +53,20 @@ class ErrorTerm:
 
 def position_shares(terms: Sequence[ErrorTerm]) -> list[float]:
     """Share of each term in the variance of the position, 0 to 1."""
-    variances = [term.translation_mm**2 for term in terms]
-    total = sum(variances)
-    return [variance / total if total > 0 else 0.0 for variance in variances]
+    variances = np.array([term.translation_mm**2 for term in terms])
+    total = sum(variances.tolist())
+    if not total > 0:
+        return [0.0] * len(terms)
+    return (variances / total).tolist()
 
 
 def largest_term(terms: Sequence[ErrorTerm]) -> tuple[str, float]:
     """Name and share of the largest term of the position; an empty name without terms."""
-    named = zip((term.name for term in terms), position_shares(terms), strict=True)
-    return max(named, key=lambda pair: pair[1], default=("", 0.0))
+    if not terms:
+        return "", 0.0
+    shares = position_shares(terms)
+    largest = shares.index(max(shares))
+    return terms[largest].name, shares[largest]
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,6 +229,18 @@ class RigPair(NamedTuple):
     second: str
     first_from_second: UncertainPose
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON values."""
+        pose = self.first_from_second.pose
+        return {
+            "parent_frame": self.first,
+            "child_frame": self.second,
+            "translation_m": pose.translation_m.tolist(),
+            "quaternion_wxyz": pose.rotation_wxyz.tolist(),
+            "matrix": pose.matrix().tolist(),
+            "covariance": self.first_from_second.covariance.tolist(),
+        }
+
 
 @dataclass(frozen=True, eq=False)
 class Rig:
@@ -241,17 +258,7 @@ class Rig:
             "cameras": {
                 name: camera.to_dict() for name, camera in self.cameras.items()
             },
-            "relative": [
-                {
-                    "parent_frame": first,
-                    "child_frame": second,
-                    "translation_m": first_from_second.pose.translation_m.tolist(),
-                    "quaternion_wxyz": first_from_second.pose.rotation_wxyz.tolist(),
-                    "matrix": first_from_second.pose.matrix().tolist(),
-                    "covariance": first_from_second.covariance.tolist(),
-                }
-                for first, second, first_from_second in self.relative
-            ],
+            "relative": [pair.to_dict() for pair in self.relative],
         }
 
     def write(self, path: PathLike) -> None:
@@ -261,7 +268,9 @@ class Rig:
 
 def rig_of(cameras: Mapping[str, Calibration]) -> Rig:
     """Compute the relative poses of eye_to_hand cameras, as if their errors were independent."""
-    scenes = {name: camera.source.get("scene") for name, camera in cameras.items()}
+    scenes = {}
+    for name, camera in cameras.items():
+        scenes[name] = camera.source.get("scene")
     if len(cameras) < 2:
         raise InputError("a rig has at least two cameras: give NAME=FOLDER for each")
     if len(set(scenes.values())) > 1:

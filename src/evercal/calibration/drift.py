@@ -21,6 +21,7 @@ from evercal.calibration.located import (
     in_parent_frame,
     length_mm_deg,
     locate,
+    mean_covariance,
     of_cause,
     shows_held_thing,
 )
@@ -122,13 +123,11 @@ def shift_between(
         scatter = _scatter(measured)
         covariance = scatter / count + scatter / before + floor
         if scene.parent_frame == "gripper":
-            covariance += (
-                np.mean([item.covariance for item in fused.select(located)], 0) / count
-            )
+            covariance += mean_covariance(fused.select(located)) / count
     else:
-        used = [item.covariance for item in fused.select(located)]
         covariance = _scatter(measured) / count + floor
-        covariance = covariance + reference.covariance + np.mean(used, axis=0)
+        by_map = mean_covariance(fused.select(located))
+        covariance = covariance + reference.covariance + by_map
     shift = shift_of(reference, fused.pose, covariance, confidence, fused.uses)
     return replace(shift, same_map=same)
 

@@ -26,7 +26,9 @@ from evercal.calibration.located import (
     halves_apart,
     in_parent_frame,
     locate,
+    mean_covariance,
     of_cause,
+    poses_of,
     shows_held_thing,
 )
 from evercal.calibration.verdict import verdict
@@ -158,8 +160,8 @@ def _held_thing_calibration(
     """The calibration that was solved for together with another grip of the thing."""
     assert view.parent_from_scene is not None, "the gripper holds the scene"
     by_lens = in_parent_frame(of_cause(view.located, lens=True), view.parent_from_scene)
-    covariances = [item.covariance for item in by_lens if item.is_located]
-    lens = np.mean(covariances, axis=0) / len(covariances)
+    shown = [item for item in by_lens if item.is_located]
+    lens = mean_covariance(shown) / len(shown)
     calibration = grip.solution.calibration()
     return replace(
         calibration,
@@ -173,7 +175,7 @@ def _held_thing_calibration(
 
 def _checks(view: _View) -> ImageChecks:
     fused = view.fused
-    poses = SE3.stack([item.pose for item in fused.select(view.in_parent)])
+    poses = poses_of(fused.select(view.in_parent))
     millimetres, degrees = halves_apart(poses) or (None, None)
     return ImageChecks(
         images_given=len(view.in_parent),
@@ -211,13 +213,13 @@ def estimated_camera(used: Sequence[ImagePose], stated: Camera) -> Camera:
 
 def _stands_still(located: Sequence[ImagePose]) -> bool:
     fused = fuse(located)
-    poses = [item.pose for item in located if item.is_located]
-    if len(poses) < 2:
+    shown = [item for item in located if item.is_located]
+    if len(shown) < 2:
         raise InputError(
             "one located image does not show whether the camera moves with the gripper: state it"
             " with `mount`, or give images of more gripper poses"
         )
-    deviation = deviations(SE3.stack(poses), fused.pose).reshape(-1, 2, 3)
+    deviation = deviations(poses_of(shown), fused.pose).reshape(-1, 2, 3)
     metres, radians = np.median(np.linalg.norm(deviation, axis=2), axis=0)
     return bool(metres < STILL_M and radians < STILL_RAD)
 

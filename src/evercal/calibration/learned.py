@@ -32,10 +32,14 @@ def learned_calibration(root: Path, scene: str | None = None) -> Calibration:
     """Return the calibration of a scene, by default the only one with gripper poses."""
     from evercal.mapping.store import stored_scenes
 
-    stored = {name: (camera, report) for name, camera, report in stored_scenes(root)}
+    stored = {}
+    wrist = []
+    for name, camera, report in stored_scenes(root):
+        stored[name] = (camera, report)
+        if report.get("hand_eye"):
+            wrist.append(name)
     if scene is not None and scene not in stored:
         raise InputError(f"scene {scene!r}: map {root} has only {', '.join(stored)}")
-    wrist = [name for name, (_, report) in stored.items() if report.get("hand_eye")]
     if scene is None and len(wrist) > 1:
         raise InputError(
             f"map {root}: {', '.join(wrist)} each have a calibration; name one, such as"

@@ -68,6 +68,16 @@ class Fused:
         return [item for item, used in zip(items, self.used, strict=True) if used]
 
 
+def poses_of(items: Sequence[ImagePose]) -> SE3:
+    """(n,) poses of images."""
+    return SE3.stack([item.pose for item in items])
+
+
+def mean_covariance(items: Sequence[ImagePose]) -> Array:
+    """(6, 6) mean of the covariances of images."""
+    return np.mean([item.covariance for item in items], axis=0)
+
+
 def locate(
     localizer: "Localizer",
     images: Sequence[tuple[str, Picture]],
@@ -133,7 +143,10 @@ def shows_held_thing(
 
 def fuse(located: Sequence[ImagePose]) -> Fused:
     """Fuse poses of one transform, with a reason for every image that is rejected."""
-    names = Counter(item.estimate.scene for item in located if item.is_located)
+    names = Counter()
+    for item in located:
+        if item.is_located:
+            names[item.estimate.scene] += 1
     if not names:
         first = located[0].estimate.reason if located else "no image was given"
         raise InputError(

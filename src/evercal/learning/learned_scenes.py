@@ -194,8 +194,7 @@ class LearnedScenes:
         stop the others.
 
         Args:
-            recordings: Recordings, their paths, or addresses such as `s3://bucket/folder`, which
-                the workers copy.
+            recordings: Recordings, their paths, or addresses such as `s3://bucket/folder`.
             read: Reads the recording at a path. Default: `load_recording`.
             workers: Processes; they share the threads of this machine.
             ray: Address of a Ray cluster, whose workers learn instead: `auto`, `HOST:PORT` or
@@ -206,19 +205,12 @@ class LearnedScenes:
             options: Sizes and priors of the map.
             on_scene: Called after each scene was added.
             on_progress: Called with the step, the recordings done, and their number.
-                Default: bars on stderr.
 
         Raises:
             InputError: A name that is taken, before anything is learned; or, after the others were
                 learned, recordings that cannot be used.
         """
-        from evercal.learning.many import (
-            in_given_order,
-            learn_scenes,
-            named_sources,
-            refuse_failures,
-            results_at,
-        )
+        from evercal.learning import many
         from evercal.learning.task import LearnTask
         from evercal.mapping.memory_budget import MemoryBudget
         from evercal.progress import shown
@@ -226,24 +218,22 @@ class LearnedScenes:
 
         MemoryBudget.parse(memory)
         read = read or load_recording
-
         # Workers of a cluster begin in another folder, and results are kept by path.
         absolute = ray is not None or results is not None
-        sources, failed = named_sources(recordings, read, self.scenes, absolute)
-        given = len(sources) + len(failed)
+        sources, failed = many.named_sources(recordings, read, self.scenes, absolute)
         reports: list[LearnReport] = []
         with self._store.writing(), shown(on_progress) as step:
             contents = self._store.contents.empty()
-            kept = results_at(results)
+            kept = many.results_at(results)
             task = LearnTask(contents, memory, options, read, kept)
-            outcomes = learn_scenes(task, sources, workers, ray)
-            for learned in in_given_order(outcomes, len(sources), step):
+            outcomes = many.learn_scenes(task, sources, workers, ray)
+            for learned in many.in_given_order(outcomes, len(sources), step):
                 if learned.scene is None or learned.report is None:
                     failed.append(f"{sources[learned.number].name} ({learned.error})")
                     continue
                 reports.append(self._commit(learned.scene, learned.report))
                 on_scene(reports[-1])
-        refuse_failures(failed, given)
+        many.refuse_failures(failed, len(failed) + len(reports))
         return tuple(reports)
 
     def refresh(

@@ -6,7 +6,6 @@ X = gripper_from_camera, A X = Z B holds for Z = base_from_map, and both are est
 Alternatively, points that the tool has touched are picked in images.
 """
 
-import itertools
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.located import locate
+from evercal.calibration.located import locate, poses_of
 from evercal.calibration.pose_pairs.fit import HandEyeFit
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve_pose_pairs
@@ -96,32 +95,31 @@ def align_by_gripper(
             images without a board are left out.
     """
     localizer = _in_own_frame(localizer, scene)
+    if camera_from_board is not None and not scale_known:
+        raise InputError(
+            "a board in the gripper is seen in metres, the map is not: bring it into the base"
+            " frame by a camera on the gripper or by touched points"
+        )
     located = []
     rows = []
     for row, item in enumerate(locate(localizer, images)):
-        if item.is_located and item.estimate.scene == scene:
-            located.append(item)
-            rows.append(row)
-    if camera_from_board is not None:
-        if not scale_known:
-            raise InputError(
-                "a board in the gripper is seen in metres, the map is not: bring it into the base"
-                " frame by a camera on the gripper or by touched points"
-            )
-        # The gripper carries the board, so the board replaces the camera.
-        shown = [item.name in camera_from_board for item in located]
-        located = list(itertools.compress(located, shown))
-        rows = list(itertools.compress(rows, shown))
-        for i, item in enumerate(located):
+        if not item.is_located or item.estimate.scene != scene:
+            continue
+        if camera_from_board is not None:
+            if item.name not in camera_from_board:
+                continue
+            # The gripper carries the board, so the board replaces the camera.
             pose = item.pose @ camera_from_board[item.name]
-            located[i] = replace(item, pose=pose)
+            item = replace(item, pose=pose)
+        located.append(item)
+        rows.append(row)
     if len(located) < LEAST_LOCATED:
         raise InputError(
             f"{len(located)} of {len(images)} images were located in {scene}; give at least"
             f" {LEAST_LOCATED} that show it from places that turn about two axes"
         )
     base_from_gripper = base_from_gripper[np.array(rows)]
-    map_from_camera = SE3.stack([item.pose for item in located])
+    map_from_camera = poses_of(located)
     names = tuple(item.name for item in located)
     pairs = PosePairs(names, base_from_gripper, map_from_camera.inverse())
     solution = solve_pose_pairs(pairs, "eye_in_hand", scale_known, of_board=False)

@@ -153,9 +153,8 @@ def hand_eye_of(
     advice = ""
     if start.mount.moves:
         advice = _advice(frames, estimate)
-    sentences = verdict_of(calibration, warnings, advice)
     return HandEye(
-        replace(calibration, verdict=sentences),
+        replace(calibration, verdict=verdict_of(calibration, warnings, advice)),
         start.pairs,
         start.of_pairs,
         start_mm,

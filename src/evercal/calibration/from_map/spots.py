@@ -11,7 +11,13 @@ from typing import NamedTuple, get_args
 import numpy as np
 
 from evercal.calibration.calibration import ErrorTerm
-from evercal.calibration.located import Fused, ImagePose, deviations
+from evercal.calibration.located import (
+    Fused,
+    ImagePose,
+    deviations,
+    mean_covariance,
+    poses_of,
+)
 from evercal.geometry import SE3, cross_matrix, pose_distance
 from evercal.localization.estimate import Cause
 from evercal.typing import Array, IntArray
@@ -35,7 +41,7 @@ class Uncertainty(NamedTuple):
 def from_one_spot(located: Sequence[ImagePose], fused: Fused) -> Uncertainty:
     """Uncertainty of a camera that stands still: of the landmarks, and scatter of the images."""
     used = fused.select(located)
-    landmarks = np.mean([item.covariance for item in used], axis=0)
+    landmarks = mean_covariance(used)
     scatter = fused.scatter / len(used)
     name = f"scatter of {len(used)} images"
     if len(used) == 1:
@@ -75,10 +81,10 @@ def from_many_spots(
         slopes.append(_by_scene_motion(parent, camera))
     slopes = np.stack(slopes)
     by_base = slopes.mean(0) @ base @ slopes.mean(0).T
-    whole = np.mean([item.covariance for item in used], axis=0)
+    whole = mean_covariance(used)
     of_base = (slopes @ base @ slopes.transpose(0, 2, 1)).mean(0)
     one_spot = (whole - of_base) / count
-    deviation = deviations(SE3.stack([item.pose for item in used]), fused.pose)
+    deviation = deviations(poses_of(used), fused.pose)
     means = np.stack([deviation[spots == spot].mean(0) for spot in range(count)])
     freedom = max(count - 1, 1)
     # The scatter contains errors of the robot's poses, which the images do not show.

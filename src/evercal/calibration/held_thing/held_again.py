@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evercal.calibration.located import ImagePose, length_mm_deg
+from evercal.calibration.located import ImagePose, length_mm_deg, poses_of
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solution import PairSolution
 from evercal.calibration.pose_pairs.solve import solve_pose_pairs
@@ -58,7 +58,7 @@ def held_again(
     pairs = PosePairs(
         tuple(item.name for item in items),
         base_from_gripper[rows],
-        SE3.stack([item.pose for item in items]).inverse(),
+        poses_of(items).inverse(),
     )
     try:
         solution = solve_pose_pairs(pairs, "eye_to_hand", of_board=False)
