@@ -27,7 +27,10 @@ TIERS = (
 def tier(calibration: Calibration) -> Tier | None:
     """Return the most demanding use that a calibration serves, by its own error."""
     mm, deg = expected_error(calibration)
-    return next((t for t in TIERS if mm < t.mm and deg < t.deg), None)
+    for use in TIERS:
+        if mm < use.mm and deg < use.deg:
+            return use
+    return None
 
 
 def expected_error(calibration: Calibration) -> tuple[float, float]:
@@ -39,8 +42,10 @@ def expected_error(calibration: Calibration) -> tuple[float, float]:
     checks = calibration.checks
     target = float(checks.target_m or 0.0)
     rotation = calibration.parent_from_child.rotation_matrix()
-    slope = np.concatenate([np.eye(3), -rotation @ cross_matrix([0.0, 0.0, target])], 1)
-    at_target = float(np.sqrt(np.trace(slope @ calibration.covariance @ slope.T)))
+    lever = -rotation @ cross_matrix([0.0, 0.0, target])
+    slope = np.concatenate([np.eye(3), lever], 1)
+    covariance = slope @ calibration.covariance @ slope.T
+    at_target = float(np.sqrt(np.trace(covariance)))
     half_mm = float(checks.repeatability_mm or 0.0) / 2
     half_deg = float(checks.repeatability_deg or 0.0) / 2
     mm = max(3**0.5 * calibration.sigma_mm, 1000 * at_target, half_mm)
@@ -69,7 +74,9 @@ def verdict(calibration: Calibration) -> str:
 def _advice(use: Tier | None) -> str:
     if use is TIERS[0]:
         return "Check it on the robot before use: touch a point that the camera sees."
-    wanted = TIERS[-1] if use is None else TIERS[TIERS.index(use) - 1]
+    wanted = TIERS[-1]
+    if use is not None:
+        wanted = TIERS[TIERS.index(use) - 1]
     return (
         f"For {wanted.name}: more poses, tilted more about two axes; let the robot stand still at"
         f" each; use a larger or nearer board."

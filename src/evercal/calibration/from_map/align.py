@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.located import locate, poses_of
+from evercal.calibration.located import ImagePose, locate, poses_of
 from evercal.calibration.pose_pairs.fit import HandEyeFit
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve_pose_pairs
@@ -88,11 +88,11 @@ def align_by_gripper(
     Args:
         localizer: Localizer of the store.
         scene: Name of the scene; its previous alignment is ignored.
-        images: Names and images of five or more places that turn about two axes.
+        images: Of five or more places that turn about two axes.
         base_from_gripper: (n,) gripper poses.
         scale_known: Whether the scene was learned in metres.
-        camera_from_board: Board poses by image name, for a fixed camera and a board in the gripper;
-            images without a board are left out.
+        camera_from_board: By image name, for a fixed camera and a board in the gripper; images
+            without a board are left out.
     """
     localizer = _in_own_frame(localizer, scene)
     if camera_from_board is not None and not scale_known:
@@ -100,8 +100,44 @@ def align_by_gripper(
             "a board in the gripper is seen in metres, the map is not: bring it into the base"
             " frame by a camera on the gripper or by touched points"
         )
-    located = []
+    rows, located = _located_in(localizer, scene, images, camera_from_board)
+    if len(located) < LEAST_LOCATED:
+        raise InputError(
+            f"{len(located)} of {len(images)} images were located in {scene}; give at least"
+            f" {LEAST_LOCATED} that show it from places that turn about two axes"
+        )
+    map_from_camera = poses_of(located)
+    names = tuple(item.name for item in located)
+    grippers = base_from_gripper[np.array(rows)]
+    pairs = PosePairs(names, grippers, map_from_camera.inverse())
+    solution = solve_pose_pairs(pairs, "eye_in_hand", scale_known, of_board=False)
+    fit = solution.fit
+    similarity = Similarity(fit.at.fixed_from_board, solution.board_scale)
+    size = 12 + solution.equation.extras.names.index("size")
+    covariance, sigma = _frame_covariance(fit, similarity, map_from_camera, size)
+    residual = fit.residual[fit.inliers].reshape(-1, 2, 3)
+    metres, radians = np.sqrt((residual**2).sum(2).mean(0))
+    return MapAlignment(
+        similarity,
+        covariance,
+        int(fit.inliers.sum()),
+        len(images),
+        f"{1000 * metres:.1f} mm and {np.rad2deg(radians):.2f} deg root mean square",
+        fit.at.parent_from_camera,
+        sigma,
+        solution.warnings,
+    )
+
+
+def _located_in(
+    localizer: "Localizer",
+    scene: str,
+    images: Sequence[tuple[str, Picture]],
+    camera_from_board: Mapping[str, SE3] | None,
+) -> tuple[list[int], list[ImagePose]]:
+    """Rows of the images that are located in a scene, and their poses, or those of the boards."""
     rows = []
+    located = []
     for row, item in enumerate(locate(localizer, images)):
         if not item.is_located or item.estimate.scene != scene:
             continue
@@ -111,33 +147,9 @@ def align_by_gripper(
             # The gripper carries the board, so the board replaces the camera.
             pose = item.pose @ camera_from_board[item.name]
             item = replace(item, pose=pose)
-        located.append(item)
         rows.append(row)
-    if len(located) < LEAST_LOCATED:
-        raise InputError(
-            f"{len(located)} of {len(images)} images were located in {scene}; give at least"
-            f" {LEAST_LOCATED} that show it from places that turn about two axes"
-        )
-    base_from_gripper = base_from_gripper[np.array(rows)]
-    map_from_camera = poses_of(located)
-    names = tuple(item.name for item in located)
-    pairs = PosePairs(names, base_from_gripper, map_from_camera.inverse())
-    solution = solve_pose_pairs(pairs, "eye_in_hand", scale_known, of_board=False)
-    fit = solution.fit
-    similarity = Similarity(fit.at.fixed_from_board, solution.board_scale)
-    size = 12 + solution.equation.extras.names.index("size")
-    covariance, sigma = _frame_covariance(fit, similarity, map_from_camera, size)
-    rms = np.sqrt((fit.residual[fit.inliers].reshape(-1, 2, 3) ** 2).sum(2).mean(0))
-    return MapAlignment(
-        similarity,
-        covariance,
-        int(fit.inliers.sum()),
-        len(images),
-        f"{1000 * rms[0]:.1f} mm and {np.rad2deg(rms[1]):.2f} deg root mean square",
-        fit.at.parent_from_camera,
-        sigma,
-        solution.warnings,
-    )
+        located.append(item)
+    return rows, located
 
 
 def _frame_covariance(

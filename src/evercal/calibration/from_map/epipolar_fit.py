@@ -77,11 +77,14 @@ class EpipolarFit:
         """First parameters (6,): rotation vector after `rotation`, position."""
         if self.mount.moves:
             axes = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-            return list(np.pad(axes * BESIDE_M, ((0, 0), (3, 0))))
-        towards = self.rotation.apply(np.concatenate([self.first, self.second]).mean(0))
-        towards = towards / np.linalg.norm(towards)
-        gripper = np.linalg.inv(self.matrices)[:, :3, 3].mean(0)
-        return [np.r_[np.zeros(3), gripper - depth * towards] for depth in DEPTHS_M]
+            positions = list(axes * BESIDE_M)
+        else:
+            rays = np.concatenate([self.first, self.second])
+            towards = self.rotation.apply(rays.mean(0))
+            towards = towards / np.linalg.norm(towards)
+            gripper = np.linalg.inv(self.matrices)[:, :3, 3].mean(0)
+            positions = [gripper - depth * towards for depth in DEPTHS_M]
+        return [np.r_[np.zeros(3), position] for position in positions]
 
     def solve(self, start: Array, centre: Array) -> Array:
         """Minimise from a start, with a prior about `centre`; all are parameters (6,)."""
@@ -117,16 +120,19 @@ class EpipolarFit:
         """(m,) angles of matches from their epipolar planes, radians."""
         camera = self.moving(x[6:]) @ self.transform(x).matrix()
         first = camera[self.ends[:, 0]]
-        second_from_first = np.linalg.inv(camera[self.ends[:, 1]]) @ first
+        second = camera[self.ends[:, 1]]
+        second_from_first = np.linalg.inv(second) @ first
         baseline = second_from_first[:, :3, 3]
         length = np.linalg.norm(baseline, axis=1, keepdims=True)
         direction = baseline / np.maximum(length, 1e-9)
         essential = cross_matrix(direction) @ second_from_first[:, :3, :3]
         essential = essential[self.number]
-        by_second = np.einsum("mij,mj->mi", essential, self.first)
-        by_first = np.einsum("mji,mj->mi", essential, self.second)
-        squares = (by_second[:, :2] ** 2).sum(1) + (by_first[:, :2] ** 2).sum(1)
-        return (self.second * by_second).sum(1) / np.sqrt(np.maximum(squares, 1e-12))
+        in_second = np.einsum("mij,mj->mi", essential, self.first)
+        in_first = np.einsum("mji,mj->mi", essential, self.second)
+        squares = (in_second[:, :2] ** 2).sum(1)
+        squares = squares + (in_first[:, :2] ** 2).sum(1)
+        slope = np.sqrt(np.maximum(squares, 1e-12))
+        return (self.second * in_second).sum(1) / slope
 
     def medians(self, x: Array) -> Array:
         """Median distance of the matches of each pair, radians."""

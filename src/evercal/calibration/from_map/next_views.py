@@ -154,8 +154,10 @@ def open_position(
     # An error of the scale moves X as far as the scene is away.
     away_m = np.linalg.norm(covariance[:3, 12]) / covariance[12, 12]
     step_m = float(np.clip(_STEP * away_m, *_STEPS_M))
-    shift = step_m * np.pad(np.stack([along, axes[:, 0], axes[:, 1]]), ((0, 0), (0, 3)))
-    turn = np.deg2rad(_TURN_DEG) * np.pad(axes[:, :2].T, ((0, 0), (3, 0)))
+    directions = np.stack([along, axes[:, 0], axes[:, 1]])
+    shift = step_m * np.pad(directions, ((0, 0), (0, 3)))
+    rotations = np.pad(axes[:, :2].T, ((0, 0), (3, 0)))
+    turn = np.deg2rad(_TURN_DEG) * rotations
     motions = {
         f"{100 * step_m:.0f} cm nearer and farther": shift[[0, 0]],
         f"{100 * step_m:.0f} cm aside without turning": shift[1:],
@@ -166,8 +168,10 @@ def open_position(
     then = {}
     for words, steps in motions.items():
         moved = begun @ SE3.exp(np.concatenate([steps, -steps]))
-        more = _of_six(known + wrist_information(moved, mount, scene_m).sum(0))
-        then[words] = 1000 * float(np.sqrt(np.linalg.eigvalsh(more[:3, :3])[-1]))
+        added = wrist_information(moved, mount, scene_m).sum(0)
+        covariance = _of_six(known + added)
+        largest = np.linalg.eigvalsh(covariance[:3, :3])[-1]
+        then[words] = 1000 * float(np.sqrt(largest))
     best = min(then, key=then.__getitem__)
     if sigmas[2] < _OPEN * then[best]:
         return None
@@ -232,9 +236,8 @@ def looked_at(base_from_camera: SE3) -> Array:
     ahead = (base_from_camera.translation_m + _AHEAD_M * axes).mean(0)
     # A weak pull towards that point decides where the axes do not.
     weight = 1e-3 * len(axes) * np.eye(3)
-    right = (
-        np.einsum("nij,nj->i", across, base_from_camera.translation_m) + weight @ ahead
-    )
+    right = np.einsum("nij,nj->i", across, base_from_camera.translation_m)
+    right = right + weight @ ahead
     return np.linalg.solve(across.sum(0) + weight, right)
 
 

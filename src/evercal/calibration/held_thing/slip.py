@@ -63,8 +63,10 @@ def largest_step(values: Array) -> Step | None:
     best = None
     for k in range(2, n - 1):
         size = values[k:].mean(0) - values[:k].mean(0)
-        total = ((values - values.mean(0)) ** 2).reshape(n, 2, 3).sum((0, 2))
-        by_step = k * (n - k) / n * (size**2).reshape(2, 3).sum(1)
+        squares = (values - values.mean(0)) ** 2
+        total = squares.reshape(n, 2, 3).sum((0, 2))
+        step = (size**2).reshape(2, 3).sum(1)
+        by_step = k * (n - k) / n * step
         rest = np.maximum(total - by_step, 1e-18)
         freedom = 3 * (n - 2)
         ratio = (by_step / 3) / (rest / freedom)

@@ -42,7 +42,8 @@ def windows(frames: Sequence[Frame], start: HandEyeStart) -> IntArray | None:
     side = int(MARGIN * np.max(high - low)) + 2 * PATCH_PX
     if not np.isfinite(low + high).all() or side > MOST_WINDOW * size.min():
         return None
-    corner = np.clip(np.rint((low + high - side) / 2), 0, size - side).astype(np.int64)
+    corner = np.rint((low + high - side) / 2)
+    corner = np.clip(corner, 0, size - side).astype(np.int64)
     return np.c_[corner, np.full(len(corner), side)]
 
 
@@ -75,6 +76,7 @@ def _points(poses: SE3, pairs: Sequence[ImagePair]) -> Array:
         ab = (a * b).sum(1)
         bb = (b * b).sum(1)
         determinant = np.maximum(aa * bb - ab**2, 1e-9)
-        along = (bb * (a @ between) - ab * (b @ between)) / determinant
+        numerator = bb * (a @ between) - ab * (b @ between)
+        along = numerator / determinant
         points.append(first[:3, 3] + a * along[:, None])
     return np.concatenate(points)
