@@ -115,10 +115,6 @@ WRONG: dict[str, tuple[Callable[[Map], object], str]] = {
         ),
         "the reference is a camera on the gripper",
     ),
-    "an amount of memory": (
-        lambda cell: cell.learn(Recording("new", (), ()), memory="ten"),
-        "memory ten: give a share of the frames",
-    ),
     "no workers": (
         lambda cell: cell.learn_many([], workers=0),
         "workers 0: give a number >= 1",
@@ -144,6 +140,30 @@ def test_what_a_caller_gets_wrong_is_one_clear_line(wrong: str, cell: Map) -> No
     assert "\n" not in message
     assert "--" not in message  # an option of the command line
     assert cell.scenes == ("hall",)
+
+
+@pytest.mark.parametrize("memory", ["0%", "120%", "ten", "-5MB", "0.1", ""])
+def test_memory_that_cannot_be_used_is_refused(
+    memory: str, hall: Recording, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=r"memory .*: give a share of the frames"):
+        Map.open(tmp_path / "map").learn(hall, memory=memory)
+    assert not (tmp_path / "map").exists()
+
+
+def test_a_new_map_locates_nothing_and_refuses_what_it_cannot_learn(
+    hall: Recording, tmp_path: Path
+) -> None:
+    opened = Map.open(tmp_path / "map")
+    few = Recording("few", hall.train[:3], ())
+    with pytest.raises(InputError, match="scene 'few': 3 training frames are too few"):
+        opened.learn(few)
+    with pytest.raises(InputError, match="missing"):
+        opened.learn(tmp_path / "missing")
+    with pytest.raises(InputError, match=r"map .*: no scene learned yet"):
+        opened.localize(IMAGE)
+    with pytest.raises(InputError, match="no scene learned yet"):
+        opened.calibrate(IMAGE)
 
 
 def test_a_pick_of_a_point_that_was_not_touched_is_named(

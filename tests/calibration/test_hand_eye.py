@@ -24,6 +24,8 @@ from evercal.recordings import Recording, load_recording
 from evercal.recordings.frame import lacks_camera_poses
 from evercal.recordings.samples import FOLDER
 
+Learned = tuple[Path, LearnReport]
+
 
 def without_camera_poses(recording: Recording) -> Recording:
     """All frames with gripper poses only."""
@@ -50,7 +52,7 @@ def truth() -> SE3:
 @pytest.fixture(scope="module")
 def learned(
     hand: Recording, truth: SE3, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, LearnReport]:
+) -> Learned:
     folder = tmp_path_factory.mktemp("wrist") / "cell"
     rough = truth @ SE3.exp([0.05, 0, 0, 0, 0.2, 0])
     arm = without_camera_poses(hand)
@@ -60,7 +62,7 @@ def learned(
 
 
 def test_gripper_from_camera_within_its_covariance(
-    learned: tuple[Path, LearnReport], truth: SE3
+    learned: Learned, truth: SE3
 ) -> None:
     whole = learned[1]
     report = learned[1].hand_eye
@@ -77,9 +79,7 @@ def test_gripper_from_camera_within_its_covariance(
     assert report.warnings == ()
 
 
-def test_the_map_keeps_the_calibration(
-    learned: tuple[Path, LearnReport], tmp_path: Path
-) -> None:
+def test_the_map_keeps_the_calibration(learned: Learned, tmp_path: Path) -> None:
     folder, report = learned
     assert report.hand_eye is not None
     shutil.copytree(folder, tmp_path / "cell")
@@ -120,7 +120,7 @@ def test_the_map_keeps_the_calibration(
 
 
 def test_a_report_written_before_version_0_2_gives_the_same_calibration(
-    learned: tuple[Path, LearnReport],
+    learned: Learned,
 ) -> None:
     folder, report = learned
     _, camera, stored = stored_scenes(folder)[0]
@@ -149,7 +149,7 @@ def test_a_map_without_gripper_poses_has_no_calibration(
 
 
 def test_images_are_located_in_the_base_frame(
-    learned: tuple[Path, LearnReport], hand: Recording
+    learned: Learned, hand: Recording
 ) -> None:
     contents = Localizer.open(learned[0]).contents
     scene = contents.scenes[0]

@@ -6,7 +6,7 @@ import pytest
 
 from evercal.calibration.from_map.hand_eye_start import HandEyeStart
 from evercal.calibration.from_map.image_pairs import ImagePair
-from evercal.calibration.held_thing.moving_parts import moving_parts
+from evercal.calibration.held_thing.moving_parts import MovingPart, moving_parts
 from evercal.calibration.held_thing.slip import largest_step
 from evercal.calibration.held_thing.windows import cropped, windows
 from evercal.geometry import SE3, Camera
@@ -57,6 +57,7 @@ def test_what_stands_still_is_removed(noise: float, gain: float) -> None:
     frames, masks = frames_of(8, noise, gain)
     moving, share = moving_parts(frames)
     assert 0.7 < share < 0.95
+    assert all(isinstance(frame.image, MovingPart) for frame in moving)  # read again
     for frame, old, mask in zip(moving, frames, masks, strict=True):
         change = np.abs(frame.read_image().astype(int) - old.read_image())[..., 0]
         assert (change[mask] <= 2).mean() > 0.9

@@ -7,7 +7,9 @@ from pathlib import Path
 from evercal.map import Map
 from evercal.mapping.build import MapOptions
 from evercal.mapping.store import MapStore
+from evercal.recordings import Recording
 
+Rooms = tuple[Recording, ...]
 QUICK = MapOptions(adjust=False)
 
 

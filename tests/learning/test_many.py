@@ -24,7 +24,7 @@ from evercal.mapping.scene_map import MapContents
 from evercal.recordings import Recording
 from evercal.recordings.images import StoredImage
 
-from .small_maps import QUICK, small_map
+from .small_maps import QUICK, Rooms, small_map
 
 
 class Deadly(StoredImage):
@@ -52,20 +52,18 @@ def deadly(recording: Recording, marks: Path, times: int) -> Recording:
 
 
 @pytest.fixture(scope="module")
-def small(rooms: tuple[Recording, ...]) -> tuple[Recording, ...]:
+def small(rooms: Rooms) -> Rooms:
     """`rooms` with as few frames as a map needs."""
     return tuple(replace(room, train=room.train[:16], test=()) for room in rooms)
 
 
 @pytest.fixture(scope="module")
-def few(small: tuple[Recording, ...]) -> Recording:
+def few(small: Rooms) -> Recording:
     """A recording of too few frames: it is refused at once."""
     return replace(small[0], name="few", train=small[0].train[:3])
 
 
-def test_the_map_is_that_of_learning_in_turn(
-    small: tuple[Recording, ...], tmp_path: Path
-) -> None:
+def test_the_map_is_that_of_learning_in_turn(small: Rooms, tmp_path: Path) -> None:
     # The first recording of another encoder determines the centroids of all scenes.
     own = tmp_path / "own.onnx"
     # `doc_string` of the model.
@@ -94,7 +92,7 @@ def test_the_map_is_that_of_learning_in_turn(
 
 
 def test_unusable_recordings_and_killed_workers_do_not_stop_the_others(
-    small: tuple[Recording, ...], few: Recording, tmp_path: Path
+    small: Rooms, few: Recording, tmp_path: Path
 ) -> None:
     once = deadly(small[0], tmp_path / "once", 1)
     always = deadly(small[2], tmp_path / "always", 99)
@@ -113,7 +111,7 @@ def test_unusable_recordings_and_killed_workers_do_not_stop_the_others(
 
 
 def test_names_are_checked_before_anything_is_learned(
-    rooms: tuple[Recording, ...], tmp_path: Path
+    rooms: Rooms, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match="alpha"):
         Map.open(tmp_path / "map").learn_many((rooms[0], rooms[1], rooms[0]))
@@ -123,7 +121,7 @@ def test_names_are_checked_before_anything_is_learned(
 
 
 def test_a_worker_killed_while_the_caller_writes_a_scene_is_replaced(
-    small: tuple[Recording, ...], few: Recording
+    small: Rooms, few: Recording
 ) -> None:
     task = LearnTask(MapContents(load_encoder(), 64), options=QUICK)
     outcomes = learn_scenes(task, (few, small[0], few), 2)
@@ -146,9 +144,7 @@ if __name__ == "__main__":
 """
 
 
-def test_workers_end_with_their_parent(
-    rooms: tuple[Recording, ...], tmp_path: Path
-) -> None:
+def test_workers_end_with_their_parent(rooms: Rooms, tmp_path: Path) -> None:
     from evercal.recordings.formats import generic
 
     for recording in rooms[:2]:
@@ -191,9 +187,7 @@ def wait_for(condition):
     return value
 
 
-def test_stopping_early_ends_the_workers(
-    small: tuple[Recording, ...], few: Recording
-) -> None:
+def test_stopping_early_ends_the_workers(small: Rooms, few: Recording) -> None:
     task = LearnTask(MapContents(load_encoder(), 64), options=QUICK)
     outcomes = learn_scenes(task, (few, *small), 2)
     next(iter(outcomes))
