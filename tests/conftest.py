@@ -295,25 +295,25 @@ def every_step(
 @pytest.fixture
 def full_disk(
     monkeypatch: pytest.MonkeyPatch,
-) -> Callable[..., AbstractContextManager[list[int]]]:
+) -> Callable[..., AbstractContextManager[list[str]]]:
     """A disk where the n-th operation that needs space fails, and all later ones or only it.
 
-    The context holds the number of operations so far.
+    The context holds the names of the operations so far.
     """
 
     real_open = open
 
     @contextmanager
-    def full(last: int, once: bool = False) -> Iterator[list[int]]:
-        count = [0]
+    def full(last: int, once: bool = False) -> Iterator[list[str]]:
+        calls: list[str] = []
 
         def failing(function: Callable[..., object]) -> Callable[..., object]:
             def call(*args: Any, **kwargs: Any) -> object:
                 mode = args[1] if len(args) > 1 else kwargs.get("mode", "r")
                 if function is real_open and not set(mode) & set("wxa+"):
                     return function(*args, **kwargs)
-                count[0] += 1
-                if count[0] == last or (count[0] > last and not once):
+                calls.append(function.__name__)
+                if len(calls) == last or (len(calls) > last and not once):
                     raise OSError(28, "No space left on device")
                 return function(*args, **kwargs)
 
@@ -325,7 +325,7 @@ def full_disk(
             opening = failing(real_open)
             patch.setattr("builtins.open", opening)
             patch.setattr("io.open", opening)
-            yield count
+            yield calls
 
     return full
 

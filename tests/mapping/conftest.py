@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from evercal.recordings.frame import Recording
 
 Contents = Callable[["MapContents"], list[object]]
+Make = Callable[[Path, Sequence["SceneMap"]], "MapStore"]
 
 
 @pytest.fixture(scope="session")
@@ -82,7 +83,7 @@ def scenes(rooms: tuple[Recording, ...]) -> list[SceneMap]:
 
 
 @pytest.fixture
-def make() -> Callable[[Path, Sequence[SceneMap]], MapStore]:
+def make() -> Make:
     """Make a store of given scenes with a tiny random encoder and its centroids."""
     from evercal.mapping.store import MapStore
 
@@ -99,6 +100,28 @@ def make() -> Callable[[Path, Sequence[SceneMap]], MapStore]:
         return store
 
     return store
+
+
+@pytest.fixture
+def root(
+    scenes: list[SceneMap],
+    tmp_path: Path,
+    make: Callable[[Path, Sequence[SceneMap]], MapStore],
+) -> Path:
+    """A map of alpha, beta and gamma."""
+    return make(tmp_path / "store", scenes).root
+
+
+@pytest.fixture
+def other(
+    scenes: list[SceneMap],
+    tmp_path: Path,
+    make: Callable[[Path, Sequence[SceneMap]], MapStore],
+) -> Path:
+    """A map of beta, with a number of frames of its own, and delta."""
+    beta = replace(scenes[1], train_frames=7)
+    delta = replace(scenes[2], name="delta")
+    return make(tmp_path / "other", [beta, delta]).root
 
 
 @pytest.fixture(scope="session")

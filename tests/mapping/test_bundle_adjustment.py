@@ -10,9 +10,10 @@ import scipy.optimize
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
-from evercal.mapping.bundle_adjustment import BundleAdjustment, noise_of
+from evercal.mapping.bundle_adjustment import BundleAdjustment
 from evercal.mapping.bundle_equations import COMMON, SHARED, Parameters
 from evercal.mapping.bundle_options import BundleOptions
+from evercal.mapping.variance_components import noise_of
 from evercal.typing import Array
 
 from .projected_tracks import (

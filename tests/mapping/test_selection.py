@@ -115,7 +115,8 @@ def test_angle_of_known_rotations(angle):
 @pytest.mark.parametrize("capacity", [1, 2, 30, 100, 400])
 @pytest.mark.parametrize("walk", [random_walk, grid_walk])
 def test_sars_equals_slow_twin(walk, capacity, radius):
-    poses = walk(np.random.default_rng(2), 300)
+    positions, quaternions = walk(np.random.default_rng(2), 300)
+    poses = (positions, quaternions)
     selected = select_sars(*poses, capacity, SarsOptions(radius=radius))
     table = metric_table(*poses).tolist()
     assert selected.tolist() == slow_sars(table, capacity, radius)

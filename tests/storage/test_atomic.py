@@ -96,7 +96,7 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(
 
 
 def test_a_folder_that_cannot_be_replaced_stays(
-    tmp_path: Path, full_disk: Callable[..., AbstractContextManager[list[int]]]
+    tmp_path: Path, full_disk: Callable[..., AbstractContextManager[list[str]]]
 ) -> None:
     for name in ("fresh", "stage"):
         (tmp_path / name).mkdir()

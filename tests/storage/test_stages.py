@@ -156,14 +156,14 @@ def test_a_change_that_is_refused_at_any_step_leaves_nothing(
     expected = copied("expected")
     change_by(action, opened(expected))
     refused = 0
-    count = [0]
+    calls: list[str] = []
     for last in range(1, 200):
         where = copied(str(last))
         store = opened(where)
         before = everything(where.parent)
         memory = list(store.stages), store.networks
         try:
-            with full_disk(last, once) as count:
+            with full_disk(last, once) as calls:
                 change_by(action, store)
         except OSError:
             refused += 1
@@ -171,7 +171,7 @@ def test_a_change_that_is_refused_at_any_step_leaves_nothing(
             assert (store.stages, store.networks) == memory
             change_by(action, store)  # the same object, once there is space
         assert everything(where) == everything(expected)
-        if count[0] < last:
+        if len(calls) < last:
             break
     else:
         pytest.fail("it was refused at every step")

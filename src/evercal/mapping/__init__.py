@@ -1,1 +1,1 @@
-"""From a recording to what stays of its scene: keyframes, depths, the atlas, the store on disk."""
+"""From a recording to the map of its scene, and to the store of maps on disk."""

@@ -31,6 +31,7 @@ from evercal.mapping.pose_check import check_poses, depth_scale, matched_pairs
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
 from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import select_farthest, spread_poses
+from evercal.mapping.stated_errors import velocity_of
 from evercal.mapping.tracks import (
     KeyframeTracks,
     opened_keyframes,
@@ -52,8 +53,6 @@ NOTICEABLE_RAD = 1e-4
 some hundredths of a pixel."""
 DOUBTFUL_WEIGHT = 0.25
 """A stated pose with a smaller weight is reported as doubtful."""
-LONG_STEP = 4
-"""A gap of the recording is a step longer than this many median ones."""
 
 
 @dataclass(frozen=True)
@@ -142,10 +141,22 @@ def build_map(
     if options.adjust:
         order = {frame.name: i for i, frame in enumerate(frames)}
         rows = [order[frame.name] for frame in prepared.frames.frames]
-        velocity = _velocity(frames)[rows]
+        velocity = velocity_of(stated_poses(frames))[rows]
         velocity /= np.repeat([prepared.unit or 1.0, 1.0], 3)
-        adjustment = _adjust(prepared.frames, tracks, velocity, options, on_progress)
-    built = _finish(name, prepared, tracks, adjustment, options)
+        adjustment = _adjust(
+            prepared.frames,
+            tracks,
+            velocity,
+            options,
+            on_progress,
+        )
+    built = _finish(
+        name,
+        prepared,
+        tracks,
+        adjustment,
+        options,
+    )
     built = replace(built, scene=replace(built.scene, train_frames=len(frames)))
     return built.take(options.memory.fitting(built.scene.keyframes))
 
@@ -211,20 +222,6 @@ def spread_frames(frames: Sequence[Frame], capacity: int) -> IntArray:
     return spread_poses(stated_poses(frames), capacity)
 
 
-def _velocity(frames: Sequence[Frame]) -> Array:
-    """(n, 6) motion per frame, camera frame; 0 beside gaps of the recording."""
-    velocity = np.zeros((len(frames), 6))
-    if len(frames) < 3:
-        return velocity
-    poses = stated_poses(frames)
-    steps = (poses[:-1].inverse() @ poses[1:]).log()
-    size = np.linalg.norm(steps, axis=1)
-    smooth = size < LONG_STEP * np.median(size) + 1e-9
-    mean = (steps[:-1] + steps[1:]) / 2
-    velocity[1:-1] = np.where((smooth[:-1] & smooth[1:])[:, None], mean, 0)
-    return velocity
-
-
 def _adjust(
     prepared: PreparedFrames,
     keyframes: list[KeyframeTracks],
@@ -284,7 +281,11 @@ def _gripper_from_camera(prepared: PreparedFrames, mount: Mount | None) -> SE3 |
     return stated_grippers(prepared.frames).inverse() @ prepared.stated
 
 
-def _moved(stated: SE3, camera: Camera, adjustment: Adjustment) -> bool:
+def _moved(
+    stated: SE3,
+    camera: Camera,
+    adjustment: Adjustment,
+) -> bool:
     """Whether projections of landmarks moved noticeably, by poses or by intrinsics."""
     change = (stated.inverse() @ adjustment.poses).log().reshape(-1, 2, 3)
     metres, radians = np.median(np.linalg.norm(change, axis=2), 0)
@@ -345,7 +346,9 @@ def _finish(
 
 
 def _map_frame(
-    adjustment: Adjustment, keyframes: IntArray, options: MapOptions
+    adjustment: Adjustment,
+    keyframes: IntArray,
+    options: MapOptions,
 ) -> MapFrame:
     """Relation of the adjusted keyframes to the frame of the stated poses."""
     # Corrections are looked up at poses without what `common` undoes.
@@ -365,7 +368,9 @@ def _map_frame(
 
 
 def _hand_eye(
-    frames: PreparedFrames, adjustment: Adjustment, options: MapOptions
+    frames: PreparedFrames,
+    adjustment: Adjustment,
+    options: MapOptions,
 ) -> HandEyeCorrection:
     by_noise = adjustment.common_covariance
     if options.mount is not None and options.mount.moves:

@@ -52,7 +52,12 @@ class Adjusted:
     """Its intrinsics as stated and as adjusted; none without adjustment."""
 
     @classmethod
-    def of(cls, adjustment: Adjustment, stated: Camera, camera: Camera) -> Self:
+    def of(
+        cls,
+        adjustment: Adjustment,
+        stated: Camera,
+        camera: Camera,
+    ) -> Self:
         """Changes by bundle adjustment, without names of frames.
 
         `stated` and `camera` are the intrinsics before and after.

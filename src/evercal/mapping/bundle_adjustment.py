@@ -33,6 +33,7 @@ from evercal.mapping.bundle_equations import (
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.stated_errors import StatedErrors, Variances
 from evercal.mapping.variance_components import (
+    noise_of,
     pose_sigma,
     shared_variances,
     student_weights,
@@ -43,10 +44,6 @@ from evercal.typing import Array, BoolArray
 
 FIXED = 1e-9
 """Prior standard deviation of shared parameters that are not adjusted."""
-MIN_NOISE = 0.02
-"""Lower bound of the standard deviation of whitened residuals."""
-MEDIAN_LENGTH = 1.177
-"""Median length of two Gaussian axes, in standard deviations."""
 INVALID_SQUARES = 1e8
 """Squared residual that an observation without a projection counts with."""
 FIRST_DAMPING = 1e-4
@@ -210,7 +207,10 @@ class BundleAdjustment:
         )
 
     def step(
-        self, tracks: BundleTracks, estimate: Estimate, variances: Variances
+        self,
+        tracks: BundleTracks,
+        estimate: Estimate,
+        variances: Variances,
     ) -> Estimate:
         """One Levenberg-Marquardt step at fixed variances.
 
@@ -250,7 +250,12 @@ class BundleAdjustment:
         # No step lowers the cost: this is its minimum.
         return Estimate(estimate.parameters, estimate.linearised, root)
 
-    def cost(self, estimate: Estimate, variances: Variances, noise: float) -> float:
+    def cost(
+        self,
+        estimate: Estimate,
+        variances: Variances,
+        noise: float,
+    ) -> float:
         """Twice the negative logarithm of the posterior: Cauchy residuals and Gaussian priors."""
         linearised = estimate.linearised
         squares = (linearised.residual**2).sum(1)
@@ -273,7 +278,13 @@ class BundleAdjustment:
         information = 1 / (1 + squares / noise**2)
         weight = information / (noise * self.options.correlation) ** 2
         prior, slope = self.errors.prior(estimate.parameters, variances)
-        return NormalEquations.of(tracks, linearised, weight, prior, slope)
+        return NormalEquations.of(
+            tracks,
+            linearised,
+            weight,
+            prior,
+            slope,
+        )
 
     def _moved(
         self,
@@ -306,13 +317,20 @@ class BundleAdjustment:
         posterior = np.einsum("knj,knj->nj", rows, rows)
         errors = self.errors.at_origin(estimate.parameters)
         sigma = pose_sigma(
-            errors, posterior, variances.weight, variances.sigma, self.options
+            errors,
+            posterior,
+            variances.weight,
+            variances.sigma,
+            self.options,
         )
         weight = student_weights(errors, sigma, self.options.tail)
         return Variances(sigma, weight, variances.shared)
 
     def _result(
-        self, tracks: BundleTracks, estimate: Estimate, variances: Variances
+        self,
+        tracks: BundleTracks,
+        estimate: Estimate,
+        variances: Variances,
     ) -> Adjustment:
         n = self.n
         parameters = estimate.parameters
@@ -360,14 +378,6 @@ class BundleAdjustment:
             offsets_prior=np.sqrt(prior),
             offsets_known=1 / information < DETERMINED * first_prior,
         )
-
-
-def noise_of(linearised: Linearised) -> float:
-    """Robust standard deviation of whitened residuals per axis."""
-    squares = (linearised.residual[linearised.valid] ** 2).sum(1)
-    if not len(squares):
-        return MIN_NOISE
-    return max(float(np.sqrt(np.median(squares))) / MEDIAN_LENGTH, MIN_NOISE)
 
 
 def _by_lens(common: Array, intrinsics: Array) -> Array:

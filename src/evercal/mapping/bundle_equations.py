@@ -11,13 +11,17 @@ from evercal.geometry import SE3, Camera, cross_matrix
 from evercal.typing import Array, BoolArray, IntArray
 
 COMMON = 6
+"""Shared parameters of the common transform."""
 SHIFT = 1
+"""Shared parameters of the time shift."""
 INTRINSICS = 5
+"""Intrinsics: logarithm of the focal length, principal point in pixels, k1, k2."""
 SHARED = COMMON + SHIFT + INTRINSICS
-"""Shared parameters: common transform, time shift, and intrinsics (logarithm of the focal length,
-principal point in pixels, k1, k2). Offsets of an arm's joints come before the intrinsics."""
+"""Shared parameters in this order. Offsets of an arm's joints come before the intrinsics."""
 MIN_DEPTH = 0.05
 """Nearer points are projected as if they were at this depth, in units of `depth_scale`."""
+MIN_DEPTH_SUM = 1e-6
+"""Added to the diagonal of the inverse depths, which are divided by it."""
 MIN_DISTORTION = 1e-4
 """Smaller changes of k1 and k2 are ignored."""
 
@@ -112,16 +116,14 @@ class StatedFrames:
         change = parameters.shared[-INTRINSICS:]
         if not (self.same_lens and np.any(change)):
             return self._cameras
-        corrected = {
-            camera: self._changed(camera, change) for camera in set(self._cameras)
-        }
-        return [corrected[camera] for camera in self._cameras]
-
-    @staticmethod
-    def _changed(camera: Camera, change: Array) -> Camera:
-        changed = camera.changed(change)
         distorts = np.abs(change[3:]).max() > MIN_DISTORTION
-        return changed if distorts else replace(changed, distortion=camera.distortion)
+        corrected = {}
+        for camera in set(self._cameras):
+            changed = camera.changed(change)
+            if not distorts:
+                changed = replace(changed, distortion=camera.distortion)
+            corrected[camera] = changed
+        return [corrected[camera] for camera in self._cameras]
 
     def linearise(self, tracks: BundleTracks, parameters: Parameters) -> Linearised:
         """Residuals and derivatives at given parameters."""
@@ -153,7 +155,13 @@ class StatedFrames:
             np.einsum("nij,nj->ni", white, pixel - tracks.observed),
             white @ np.concatenate([by_host, -by_host @ cross_matrix(ray / rho)], 2),
             white @ np.concatenate([-by_point, by_point @ cross_matrix(point)], 2),
-            np.einsum("nij,njk,nk->ni", white, -by_host, ray) / rho**2,
+            np.einsum(
+                "nij,njk,nk->ni",
+                white,
+                -by_host,
+                ray,
+            )
+            / rho**2,
             white @ (by_camera + by_ray @ ray_slope),
         )
         # The distortion of the current estimate can be too strong for a landmark near the edge.
@@ -177,23 +185,20 @@ class StatedFrames:
 
     def _corrected(self, parameters: Parameters) -> tuple[Array, Array]:
         """Rotations (n, 3, 3) and positions (n, 3) of the corrected poses."""
-        own = parameters.correction
-        rotation = self._rotation @ Rotation.from_rotvec(own[:, 3:]).as_matrix()
-        return rotation, self._position + np.einsum(
-            "nij,nj->ni", self._rotation, own[:, :3]
-        )
+        translation, turn = np.split(parameters.correction, 2, axis=1)
+        rotation = self._rotation @ Rotation.from_rotvec(turn).as_matrix()
+        shift = np.einsum("nij,nj->ni", self._rotation, translation)
+        return rotation, self._position + shift
 
     def _by_camera(
         self, parameters: Parameters, frames: IntArray
     ) -> list[tuple[Camera, IntArray]]:
-        groups: dict[Camera, list[int]] = {}
-        for i, camera in enumerate(self.cameras(parameters)):
-            groups.setdefault(camera, []).append(i)
-        if len(groups) == 1:
-            return [(camera, np.arange(len(frames))) for camera in groups]
-        return [
-            (c, np.flatnonzero(np.isin(frames, which))) for c, which in groups.items()
-        ]
+        cameras = self.cameras(parameters)
+        groups = []
+        for camera in dict.fromkeys(cameras):
+            numbers = [i for i, other in enumerate(cameras) if other == camera]
+            groups.append((camera, np.flatnonzero(np.isin(frames, numbers))))
+        return groups
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,41 +253,49 @@ class NormalEquations:
     ) -> Self:
         """Sum the products of derivatives, weighted (m,), over the observations of each host."""
         root = np.sqrt(weight)[:, None]
-        p = len(tracks.host)
-        six = np.arange(6)
-        rows = (
-            np.concatenate([lin.by_host, lin.by_frame, lin.by_intrinsics], 2)
-            * root[..., None]
-        )
+        derivatives = np.concatenate([lin.by_host, lin.by_frame, lin.by_intrinsics], 2)
+        rows = derivatives * root[..., None]
         residual = lin.residual * root
         by_depth = lin.by_depth * root
-        depth = np.bincount(tracks.landmark, (by_depth**2).sum(1), p) + 1e-6
-        depth_slope = np.bincount(tracks.landmark, (by_depth * residual).sum(1), p)
+        count = len(tracks.host)
+        depth = (
+            np.bincount(tracks.landmark, (by_depth**2).sum(1), count) + MIN_DEPTH_SUM
+        )
+        depth_slope = (by_depth * residual).sum(1)
+        depth_slope = np.bincount(tracks.landmark, depth_slope, count)
         mixed = np.einsum("mr,mrc->mc", by_depth, rows)
         gram = np.zeros(prior.shape)
         slope = slope.copy()
+        six = np.arange(6)
+        last = np.arange(len(gram) - INTRINSICS, len(gram))
         blocks = []
         for host in np.unique(tracks.host_frame):
-            own = np.flatnonzero(tracks.host_frame == host)
-            landmarks, place = np.unique(tracks.landmark[own], return_inverse=True)
-            frames = np.unique(tracks.frame[own])
-            last = np.arange(len(gram) - INTRINSICS, len(gram))
-            seen = (6 * frames[:, None] + six).ravel()
-            columns = np.concatenate([6 * host + six, seen, last])
-            local = np.zeros((len(columns),) * 2)
+            of_host = np.flatnonzero(tracks.host_frame == host)
+            landmarks, place = np.unique(tracks.landmark[of_host], return_inverse=True)
+            frames, frame = np.unique(tracks.frame[of_host], return_inverse=True)
+            by_frames = (6 * frames[:, None] + six).ravel()
+            columns = np.concatenate([6 * host + six, by_frames, last])
+            local = np.zeros((len(columns), len(columns)))
             block = np.zeros((len(landmarks), len(columns)))
-            for number, frame in enumerate(frames):
-                which = tracks.frame[own] == frame
-                part = own[which]
-                at = np.r_[0:6, 6 + 6 * number + six, -INTRINSICS:0]
-                product = rows[part].reshape(-1, len(at))
-                local[at[:, None], at] += product.T @ product
-                slope[columns[at]] += product.T @ residual[part].ravel()
+            for number in range(len(frames)):
+                in_frame = frame == number
+                observed = of_host[in_frame]
+                where = np.r_[0:6, 6 + 6 * number + six, -INTRINSICS:0]
+                product = rows[observed].reshape(-1, len(where))
+                local[where[:, None], where] += product.T @ product
+                slope[columns[where]] += product.T @ residual[observed].ravel()
                 # A frame sees a landmark once.
-                block[place[which][:, None], at] += mixed[part]
+                block[place[in_frame][:, None], where] += mixed[observed]
             gram[columns[:, None], columns] += local
             blocks.append(HostBlock(landmarks, columns, block))
-        return cls(gram, prior, blocks, depth, slope, depth_slope.astype(np.float64))
+        return cls(
+            gram,
+            prior,
+            blocks,
+            depth,
+            slope,
+            depth_slope.astype(np.float64),
+        )
 
     def solve(self, damping: float) -> Solution | None:
         """Solve with diagonal elements raised by a share; None if not positive definite."""
@@ -310,4 +323,9 @@ class NormalEquations:
         depths = depths / depth
         if not (np.isfinite(change).all() and np.isfinite(depths).all()):
             return None
-        return Solution(change, depths, root, float(np.linalg.norm(whitened)))
+        return Solution(
+            change,
+            depths,
+            root,
+            float(np.linalg.norm(whitened)),
+        )

@@ -44,7 +44,14 @@ def bundle_tracks(
         number = np.full(len(keyframe.landmarks), -1)
         number[which] = start + np.arange(len(which))
         for j in frames:
-            observed = observe(recording, keyframe, j, which, WIDE_STEPS, WIDE_REACH_PX)
+            observed = observe(
+                recording,
+                keyframe,
+                j,
+                which,
+                WIDE_STEPS,
+                WIDE_REACH_PX,
+            )
             parts.append(observed._replace(landmark=number[observed.landmark]))
         host.append(np.full(len(which), keyframe.frame))
         pixels.append(keyframe.landmarks.pixels[which])

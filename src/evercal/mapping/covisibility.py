@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from evercal.geometry.camera import Camera
-from evercal.geometry.se3 import SE3
+from evercal.geometry import SE3, Camera
 from evercal.mapping.plane_sweep import PosedCells
 from evercal.typing import Array, BoolArray
 
@@ -24,7 +23,11 @@ LEAST_COSINE = 0.7
 
 
 def select_source_views(
-    depth_m: Array, view: PosedCells, poses: SE3, cameras: Sequence[Camera], count: int
+    depth_m: Array,
+    view: PosedCells,
+    poses: SE3,
+    cameras: Sequence[Camera],
+    count: int,
 ) -> list[int]:
     """Select the views that show the surfaces of a view under good parallax.
 
@@ -41,7 +44,10 @@ def select_source_views(
 
 
 def shared_view(
-    depth_m: Array, view: PosedCells, poses: SE3, cameras: Sequence[Camera]
+    depth_m: Array,
+    view: PosedCells,
+    poses: SE3,
+    cameras: Sequence[Camera],
 ) -> Array:
     """(n,) share of a view that each camera shows from a similar direction.
 
@@ -53,7 +59,10 @@ def shared_view(
 
 
 def _shown(
-    depth_m: Array, view: PosedCells, poses: SE3, cameras: Sequence[Camera]
+    depth_m: Array,
+    view: PosedCells,
+    poses: SE3,
+    cameras: Sequence[Camera],
 ) -> tuple[BoolArray, Array]:
     """Whether each camera shows each probed cell (n, 64), and cosines of the parallax."""
     cells = np.linspace(0, len(depth_m) - 1, PROBED_CELLS).astype(int)

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.features.views import working_image
-from evercal.geometry.camera import Camera
-from evercal.geometry.se3 import SE3
+from evercal.geometry import SE3, Camera
 from evercal.mapping.landmarks import Landmarks
 from evercal.recordings.frame import Frame
 from evercal.recordings.images import encode_jpeg

@@ -106,7 +106,9 @@ def project_surface(
 
 
 def detect(
-    grey: Image, grid: tuple[int, int], cell_px: float
+    grey: Image,
+    grid: tuple[int, int],
+    cell_px: float,
 ) -> tuple[Array, IntArray]:
     """Detect the most textured pixel of every textured cell.
 
@@ -132,13 +134,31 @@ def detect(
     return np.array(pixels, float).reshape(-1, 2), np.array(cells, np.int64)
 
 
-def slopes(inverse_depth: Array, grid: tuple[int, int], cell_px: float) -> Array:
+def slopes(
+    inverse_depth: Array,
+    grid: tuple[int, int],
+    cell_px: float,
+) -> Array:
     """(cells, 2) change of inverse depth per pixel, from the inverse depths (cells,) of a grid.
 
     The inverse depth of a plane is linear in the image, so its gradient is the plane's slant.
     """
     field = cv2.medianBlur(inverse_depth.reshape(grid).astype(np.float32), 3)
     field = cv2.GaussianBlur(field, (0, 0), 1.0)
-    right = cv2.Sobel(field, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
-    down = cv2.Sobel(field, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
+    right = cv2.Sobel(
+        field,
+        cv2.CV_32F,
+        1,
+        0,
+        ksize=3,
+        scale=1 / 8,
+    )
+    down = cv2.Sobel(
+        field,
+        cv2.CV_32F,
+        0,
+        1,
+        ksize=3,
+        scale=1 / 8,
+    )
     return np.stack([right, down], -1).reshape(-1, 2).astype(np.float64) / cell_px

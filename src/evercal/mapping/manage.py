@@ -102,7 +102,11 @@ def remove_scenes(store: MapStore, names: Sequence[str]) -> None:
     store.contents = replace(store.contents, scenes=[scenes[i] for i in left])
 
 
-def rename_scene(store: MapStore, name: str, new: str) -> None:
+def rename_scene(
+    store: MapStore,
+    name: str,
+    new: str,
+) -> None:
     """Give a scene another name."""
     index = _index(store, name)
     if checked_name(new) in store.contents.names:
@@ -159,7 +163,13 @@ def merge_maps(
         for item in scenes:
             merge.add(item)
     if merge.incoming:
-        _commit(store, merge, contents, networks, roots[0])
+        _commit(
+            store,
+            merge,
+            contents,
+            networks,
+            roots[0],
+        )
     return Merged(
         tuple(merge.incoming),
         tuple(merge.renamed),
@@ -190,7 +200,11 @@ def pack_map(root: Path, file: Path) -> None:
     read_store(root, write)
 
 
-def unpack_map(file: Path, folder: Path, limits: ArchiveLimits | None = None) -> None:
+def unpack_map(
+    file: Path,
+    folder: Path,
+    limits: ArchiveLimits | None = None,
+) -> None:
     """Extract a map that `pack_map` has written: whole, or not at all.
 
     The archive is not trusted: paths, links, sizes, checksums and schema are checked, and every
@@ -258,7 +272,10 @@ def _incoming(root: Path) -> tuple[Manifest, list[_Incoming]]:
 
 
 def _require_same_networks(
-    first: Manifest, other: Manifest, root: Path, path: Path
+    first: Manifest,
+    other: Manifest,
+    root: Path,
+    path: Path,
 ) -> None:
     for key, meaning in (("short_side", "image size"), ("strategy", "strategy")):
         expected = first.payload.get(key)
@@ -296,7 +313,11 @@ def _commit(
 ) -> None:
     """Write a merged map. A new one also gets the networks of the first map, `source`."""
 
-    def copy(name: str, item: _Incoming, folder: Path) -> None:
+    def copy(
+        name: str,
+        item: _Incoming,
+        folder: Path,
+    ) -> None:
         if networks is not None:
             store.networks = tuple(networks.payload["networks"])
             for network in store.networks:
@@ -320,7 +341,12 @@ def _commit(
     store.contents = replace(contents, scenes=scenes)
 
 
-def _copy(root: Path, file: str, manifest: Manifest, target: Path) -> None:
+def _copy(
+    root: Path,
+    file: str,
+    manifest: Manifest,
+    target: Path,
+) -> None:
     try:
         data = (root / file).read_bytes()
     except FileNotFoundError:
@@ -330,7 +356,11 @@ def _copy(root: Path, file: str, manifest: Manifest, target: Path) -> None:
     write_bytes(target, data)
 
 
-def _require_map_of(root: Path, names: Sequence[str], file: Path) -> None:
+def _require_map_of(
+    root: Path,
+    names: Sequence[str],
+    file: Path,
+) -> None:
     try:
         listed = {MANIFEST, *Manifest.read(root).files}
         if extra := sorted(set(names) - listed):

@@ -22,8 +22,12 @@ RADII = ((0.1, 10.0), (0.2, 15.0), (0.4, 25.0))
 """Candidate correlation lengths of corrections, metres and degrees."""
 MIN_EXPLAINED = 0.3
 """Share of the corrections' variance that neighbours must explain."""
+LEAST_CORRECTION_M = 1e-4
+"""Smaller mean corrections of positions are not predicted, metres."""
+LEAST_CORRECTION_RAD = 1e-5
+"""The same for rotations, radians."""
 SHRINKAGE = 0.3
-"""Weight of a zero correction, in neighbours."""
+"""A zero correction counts as this many neighbours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +60,8 @@ class Similarity:
 
     def pose(self, map_from_camera: SE3) -> SE3:
         """Camera pose in the base frame."""
-        scaled = SE3(
-            map_from_camera.rotation_wxyz, self.scale * map_from_camera.translation_m
-        )
-        return self.base_from_map @ scaled
+        translation = self.scale * map_from_camera.translation_m
+        return self.base_from_map @ SE3(map_from_camera.rotation_wxyz, translation)
 
     def inverse_pose(self, base_from_camera: SE3) -> SE3:
         """Camera pose in the map's own frame."""
@@ -97,8 +99,7 @@ class MapFrame:
         covariance.
         """
         variance = np.square(self.pose_sigma) + np.square(self.frame_sigma)
-        own = np.diag(np.repeat(variance, 3))
-        covariance = map_from_camera.covariance + own
+        covariance = map_from_camera.covariance + np.diag(np.repeat(variance, 3))
         pose = self._undo(map_from_camera.pose)
         if self.similarity is not None:
             pose = self.similarity.pose(pose)
@@ -170,26 +171,29 @@ def fit_correction(poses: SE3, correction: Array) -> FrameCorrection | None:
     Corrections (n, 6) are without the common transform and the time shift. Returns None if
     neighbours explain too little of them.
     """
-    scale = np.repeat(
-        [np.abs(correction[:, :3]).mean(), np.abs(correction[:, 3:]).mean()], 3
-    )
-    if (scale[[0, 3]] < [1e-4, 1e-5]).any():
+    size = np.abs(correction)
+    metres = size[:, :3].mean()
+    radians = size[:, 3:].mean()
+    if metres < LEAST_CORRECTION_M or radians < LEAST_CORRECTION_RAD:
         return None
-    best: tuple[float, tuple[float, float]] = (MIN_EXPLAINED, RADII[0])
+    scale = np.repeat([metres, radians], 3)
     total = float(((correction / scale) ** 2).sum())
+    most_explained = MIN_EXPLAINED
+    best = None
     for metres, degrees in RADII:
         radius = (metres, float(np.deg2rad(degrees)))
         left = correction - _left_out(poses, correction, radius)
         explained = 1 - float(((left / scale) ** 2).sum()) / total
-        if explained > best[0]:
-            best = (explained, radius)
-    if best[0] <= MIN_EXPLAINED:
-        return None
-    return FrameCorrection(poses, correction, best[1])
+        if explained > most_explained:
+            most_explained = explained
+            best = FrameCorrection(poses, correction, radius)
+    return best
 
 
 def shared_sigma(
-    poses: SE3, correction: Array, fitted: FrameCorrection | None
+    poses: SE3,
+    correction: Array,
+    fitted: FrameCorrection | None,
 ) -> tuple[float, float]:
     """Standard deviation per axis of stated poses whose errors neighbouring frames share.
 
@@ -202,24 +206,36 @@ def shared_sigma(
     left = correction
     if fitted is not None:
         left = correction - _left_out(poses, correction, fitted.radius)
-    sigmas = []
-    for axes in (slice(0, 3), slice(3, 6)):
-        part = left[:, axes]
-        variance = float((correction[:, axes] ** 2).mean())
-        shared = float((part[:-1] * part[1:]).mean())
-        error = float((part**2).mean()) / np.sqrt(part[1:].size)
-        sigmas.append(float(np.sqrt(variance)) if shared > 3 * error else 0.0)
-    return sigmas[0], sigmas[1]
+    metres = _shared(correction[:, :3], left[:, :3])
+    radians = _shared(correction[:, 3:], left[:, 3:])
+    return metres, radians
 
 
-def _left_out(poses: SE3, correction: Array, radius: tuple[float, float]) -> Array:
+def _shared(correction: Array, left: Array) -> float:
+    """`shared_sigma` of three axes (n, 3), by what neighbours leave of the corrections."""
+    shared = float((left[:-1] * left[1:]).mean())
+    error = float((left**2).mean()) / np.sqrt(left[1:].size)
+    if shared <= 3 * error:
+        return 0.0
+    return float(np.sqrt((correction**2).mean()))
+
+
+def _left_out(
+    poses: SE3,
+    correction: Array,
+    radius: tuple[float, float],
+) -> Array:
     """(n, 6) corrections that the other frames predict."""
     weight = np.stack([_closeness(poses, poses[i], radius) for i in range(len(poses))])
     np.fill_diagonal(weight, 0)
     return weight @ correction / (weight.sum(1, keepdims=True) + SHRINKAGE)
 
 
-def _closeness(poses: SE3, pose: SE3, radius: tuple[float, float]) -> Array:
+def _closeness(
+    poses: SE3,
+    pose: SE3,
+    radius: tuple[float, float],
+) -> Array:
     """(n,) Gaussian weights of poses by their distance to one pose."""
     metres = np.linalg.norm(poses.translation_m - pose.translation_m, axis=-1)
     cosine = np.abs(poses.rotation_wxyz @ pose.rotation_wxyz).clip(0, 1)

@@ -111,7 +111,11 @@ def cut_patches(image: Array, pixels: Array) -> Patches:
 
 
 def align_patches(
-    patches: Patches, image: Array, centres: Array, affines: Array, iterations: int
+    patches: Patches,
+    image: Array,
+    centres: Array,
+    affines: Array,
+    iterations: int,
 ) -> tuple[Array, Array]:
     """Align patches in another image.
 
@@ -122,7 +126,13 @@ def align_patches(
         head = slice(_MOST_ROWS)
         rest = slice(_MOST_ROWS, None)
         aligned = [
-            align_patches(patches.take(p), image, centres[p], affines[p], iterations)
+            align_patches(
+                patches.take(p),
+                image,
+                centres[p],
+                affines[p],
+                iterations,
+            )
             for p in (head, rest)
         ]
         pixels, correlations = zip(*aligned, strict=True)
@@ -171,7 +181,11 @@ def align_down(
     correlation = np.zeros(len(start))
     for level, iterations in steps:
         pixels, correlation = align_patches(
-            levels[level], pyramid[level], to_level(pixels, level), affines, iterations
+            levels[level],
+            pyramid[level],
+            to_level(pixels, level),
+            affines,
+            iterations,
         )
         pixels = from_level(pixels.astype(np.float64), level)
     return pixels, correlation
@@ -215,11 +229,19 @@ def whitening(
     return white
 
 
-def _sample(image: Array, right: Array, down: Array) -> Array:
+def _sample(
+    image: Array,
+    right: Array,
+    down: Array,
+) -> Array:
     """(n, p) intensities at (n, p) columns and rows."""
     if not len(right):
         return np.zeros(right.shape, np.float32)
     values = cv2.remap(
-        image, right, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        image,
+        right,
+        down,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
     )
     return np.asarray(values, np.float32)

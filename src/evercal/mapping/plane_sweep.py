@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.features.views import ideal_cell_pixels
-from evercal.geometry.camera import Camera
-from evercal.geometry.se3 import SE3
+from evercal.geometry import SE3, Camera
 from evercal.typing import Array, BoolArray, Float32Array
 
 NEAR_M = 0.25
@@ -29,7 +28,11 @@ SEEN_BY = 4
 SMOOTHING = 0.7
 """Share of a cell's neighbours in its similarity."""
 MIN_PEAK_SIMILARITY = 0.4
-_MOST_ROWS = 30_000  # cv2.remap takes images of up to 32,767 rows
+"""Peaks of less similarity have no weight in the refinement."""
+_MOST_ROWS = 30_000
+"""Rows that are sampled at once: cv2.remap takes images of up to 32,767 rows."""
+DEPTH_STEP = 1e-4
+"""Step of a numerical derivative by the inverse depth, per metre."""
 OUTLIER_PX = 4.0
 """Residuals beyond this have little weight in the refinement."""
 
@@ -87,7 +90,12 @@ def inverse_depths(
     if not others:
         return (1 / guess_m).clip(least, most).astype(np.float32)
     sources = [_SourceView(view, other) for other in others]
-    planes = np.linspace(least, most, PLANES, dtype=np.float32)
+    planes = np.linspace(
+        least,
+        most,
+        PLANES,
+        dtype=np.float32,
+    )
     similarity = np.stack([source.along(planes) for source in sources])
     if len(sources) > SEEN_BY:
         similarity = np.partition(similarity, -SEEN_BY, 0)[-SEEN_BY:]
@@ -113,7 +121,14 @@ def _sums(values: Array) -> Array:
     """Sums over the 3x3 around each cell of (h, w, ...)."""
     kind = cv2.BORDER_CONSTANT
     return np.asarray(
-        cv2.boxFilter(values, -1, (3, 3), normalize=False, borderType=kind), float
+        cv2.boxFilter(
+            values,
+            -1,
+            (3, 3),
+            normalize=False,
+            borderType=kind,
+        ),
+        float,
     )
 
 
@@ -121,7 +136,8 @@ class _SourceView:
     """Similarity of the cells of a view to all cells of one other view."""
 
     def __init__(self, view: PosedCells, other: PosedCells):
-        self.other, (self.rows, self.columns) = other, other.grid
+        self.other = other
+        self.rows, self.columns = other.grid
         other_from_view = other.base_from_camera.inverse() @ view.base_from_camera
         self.ray = view.rays() @ other_from_view.rotation_matrix().T
         self.translation = other_from_view.translation_m
@@ -129,12 +145,12 @@ class _SourceView:
 
     def pixels(self, inverse: Array) -> tuple[Array, Array, BoolArray]:
         """Columns and rows (cells, ...) at inverse depths (cells, ...), and whether visible."""
-        shape = (-1, *[1] * (inverse.ndim - 1))
-        x, y, z = (
-            self.ray[:, i].reshape(shape).astype(inverse.dtype)
-            + inverse * inverse.dtype.type(self.translation[i])
-            for i in range(3)
-        )
+        ray = self.ray.astype(inverse.dtype).T
+        ray = ray.reshape(3, -1, *[1] * (inverse.ndim - 1))
+        translation = self.translation.astype(inverse.dtype)
+        x = ray[0] + inverse * translation[0]
+        y = ray[1] + inverse * translation[1]
+        z = ray[2] + inverse * translation[2]
         front = z > 0.05
         z = np.where(front, z, 1)
         camera = self.other.camera
@@ -142,8 +158,10 @@ class _SourceView:
             pixels = camera.project(np.stack([x, y, z], -1))
             front &= np.isfinite(pixels).all(-1)
             u, v = np.moveaxis(np.nan_to_num(pixels).astype(inverse.dtype), -1, 0)
-            return u, v, front
-        return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, front
+        else:
+            u = camera.fx * x / z + camera.cx
+            v = camera.fy * y / z + camera.cy
+        return u, v, front
 
     def along(self, planes: Array) -> Array:
         """(cells, planes) similarity at inverse depths, 0 outside this view."""
@@ -154,43 +172,55 @@ class _SourceView:
         down = (v + 0.5) / stride - 0.5
         for at, last in ((right, self.columns - 1), (down, self.rows - 1)):
             inside &= (at > -1) & (at < last + 1)
-            np.clip(at, 0, last, out=at)
+            np.clip(
+                at,
+                0,
+                last,
+                out=at,
+            )
         sampled = np.empty((cells, len(planes)), np.float32)
         # The grids of many cells one below the other are one image.
-        block = _MOST_ROWS // self.rows
-        for start in range(0, cells, block):
-            part = slice(start, start + block)
-            image = self.similarity[part].reshape(-1, self.columns)
-            top = (
-                np.arange(len(image) // self.rows, dtype=np.float32)[:, None]
-                * self.rows
-            )
-            sampled[part] = cv2.remap(
-                image, right[part], down[part] + top, cv2.INTER_LINEAR
+        most = _MOST_ROWS // self.rows
+        tops = self.rows * np.arange(most, dtype=np.float32)[:, None]
+        for start in range(0, cells, most):
+            block = slice(start, start + most)
+            image = self.similarity[block].reshape(-1, self.columns)
+            below = down[block]
+            below = below + tops[: len(below)]
+            sampled[block] = cv2.remap(
+                image,
+                right[block],
+                below,
+                cv2.INTER_LINEAR,
             )
         return np.maximum(sampled, 0) * inside
 
     def normal_equation(self, inverse: Array) -> tuple[Array, Array]:
         """Gradient and Hessian (cells,) of least squares in the inverse depth of each cell."""
         rho = inverse.astype(np.float64)
-        *here, front = self.pixels(rho)
-        here = np.stack(here, 1)
-        delta = 1e-4
+        u, v, front = self.pixels(rho)
+        here = np.stack([u, v], 1)
+        u, v, _ = self.pixels(rho + DEPTH_STEP)
+        slope = (np.stack([u, v], 1) - here) / DEPTH_STEP
         stride = self.other.stride
-        slope = (np.stack(self.pixels(rho + delta)[:2], 1) - here) / delta
-        cell = np.rint((here - (stride - 1) / 2) / stride).astype(int)
+        centre = (stride - 1) / 2
+        cell = np.rint((here - centre) / stride).astype(int)
         last = np.array([self.columns - 2, self.rows - 2])
-        inside = front & (cell >= 1).all(1) & (cell <= last).all(1)
-        column, row = cell.clip(1, last).T
-        position, similarity = peak(self.similarity, row, column)
-        residual = stride * position + (stride - 1) / 2 - here
+        inner = cell.clip(1, last)
+        inside = front & (cell == inner).all(1)
+        position, similarity = peak(self.similarity, inner[:, 1], inner[:, 0])
+        residual = stride * position + centre - here
         weight = inside * np.maximum(similarity - MIN_PEAK_SIMILARITY, 0) ** 2
         weight = weight / (1 + (residual**2).sum(1) / OUTLIER_PX**2)
-        return weight * (slope * residual).sum(1), weight * (slope * slope).sum(1)
+        gradient = weight * (slope * residual).sum(1)
+        hessian = weight * (slope * slope).sum(1)
+        return gradient, hessian
 
 
 def peak(
-    similarity: Array, row: NDArray[np.integer], column: NDArray[np.integer]
+    similarity: Array,
+    row: NDArray[np.integer],
+    column: NDArray[np.integer],
 ) -> tuple[Array, Array]:
     """The most similar cell of the 3x3 around a cell, to a fraction of a cell.
 
@@ -200,24 +230,26 @@ def peak(
     """
     _, height, width = similarity.shape
     n = np.arange(len(similarity))
-    steps = np.array([(v, u) for v in (-1, 0, 1) for u in (-1, 0, 1)])
-    patch = similarity[
-        n[:, None], row[:, None] + steps[:, 0], column[:, None] + steps[:, 1]
-    ]
-    best = steps[patch.argmax(1)]
-    row = (row + best[:, 0]).clip(1, height - 2)
-    column = (column + best[:, 1]).clip(1, width - 2)
+    down, right = np.indices((3, 3)).reshape(2, 9) - 1
+    patch = similarity[n[:, None], row[:, None] + down, column[:, None] + right]
+    best = patch.argmax(1)
+    row = (row + down[best]).clip(1, height - 2)
+    column = (column + right[best]).clip(1, width - 2)
     middle = similarity[n, row, column]
-    du = parabola(
-        similarity[n, row, column - 1], middle, similarity[n, row, column + 1]
-    )
-    dv = parabola(
-        similarity[n, row - 1, column], middle, similarity[n, row + 1, column]
-    )
-    return np.stack([column + du, row + dv], 1), middle
+    left = similarity[n, row, column - 1]
+    right = similarity[n, row, column + 1]
+    above = similarity[n, row - 1, column]
+    below = similarity[n, row + 1, column]
+    u = column + parabola(left, middle, right)
+    v = row + parabola(above, middle, below)
+    return np.stack([u, v], 1), middle
 
 
-def parabola(before: Array, middle: Array, after: Array) -> Array:
+def parabola(
+    before: Array,
+    middle: Array,
+    after: Array,
+) -> Array:
     """Maximum of a parabola through three values, relative to the middle; at most half a step."""
     curvature = np.minimum(before - 2 * middle + after, -1e-3)
     return (0.5 * (before - after) / curvature).clip(-0.5, 0.5)

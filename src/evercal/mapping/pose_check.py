@@ -23,9 +23,10 @@ from evercal.mapping.plane_sweep import FAR_M, NEAR_M, USUAL_M
 from evercal.mapping.prepared_frames import PreparedFrames
 from evercal.typing import Array, BoolArray, IntArray
 
-MIN_PARALLAX_PX, MAX_EPIPOLAR_PX = 16.0, 4.0
-"""Matches are triangulated if parallax moves them by more than the first, and they lie nearer to
-their epipolar lines than the second. Pixels at the encoder's working size."""
+MIN_PARALLAX_PX = 16.0
+"""Smallest parallax of matches that are triangulated, pixels at the encoder's working size."""
+MAX_EPIPOLAR_PX = 4.0
+"""Largest distance of triangulated matches from their epipolar lines, pixels at the same size."""
 MIN_DEPTHS = 100
 """Triangulated matches that a depth scale needs."""
 PARTNERS = 5
@@ -39,9 +40,10 @@ MIN_MATCH_SIMILARITY = 0.6
 """Smallest cosine of matched features."""
 MIN_MATCHES = 30
 """Pairs with fewer mutual matches are ignored."""
-RATIO, NEIGHBOURS = 0.9, 2.5
-"""Ratio test (Lowe, IJCV 2004); cells within this radius of a match are not compared. Repeated
-texture would contradict right poses."""
+RATIO = 0.9
+"""Ratio test (Lowe, IJCV 2004): repeated texture would contradict right poses."""
+NEIGHBOURS = 2.5
+"""Radius around a match, in cells, inside which the ratio test compares no cells."""
 STRIDE = 3
 """Step between the cells of the first frame that are matched."""
 
@@ -76,45 +78,41 @@ class PoseCheck:
 
 def matched_pairs(recording: PreparedFrames, vlad: Vlad) -> list[MatchedPair]:
     """Match every frame with the most similar ones."""
-    pairs = similar_pairs(
-        [recording.features(i) for i in range(len(recording))], vlad, PARTNERS
-    )
-    matched = [_matched(recording, i, j) for i, j in pairs]
-    return [pair for pair in matched if len(pair.ray) >= MIN_MATCHES]
+    features = [recording.features(i) for i in range(len(recording))]
+    matched = []
+    for i, j in similar_pairs(features, vlad, PARTNERS):
+        pair = _matched(recording, i, j)
+        if len(pair.ray) >= MIN_MATCHES:
+            matched.append(pair)
+    return matched
 
 
 def check_poses(recording: PreparedFrames, pairs: list[MatchedPair]) -> PoseCheck:
     """Find frames whose stated pose contradicts most of their partners."""
     count = len(recording)
     sift = _SiftCheck(recording)
-    partners: dict[int, set[int]] = {i: set() for i in range(count)}
-    for pair in pairs:
-        partners[pair.first].add(pair.second)
-        partners[pair.second].add(pair.first)
-    rest = [(pair.first, pair.second, _distance(recording, pair)) for pair in pairs]
+    distances = [_distance(recording, pair) for pair in pairs]
+    contradicts = np.array(distances) > MAX_DISTANCE_PX
+    frames = np.array([(pair.first, pair.second) for pair in pairs]).reshape(-1, 2)
+    rest = np.ones(len(pairs), bool)
     wrong: list[int] = []
     untracked: list[int] = []
-    while rest:
-        against = np.zeros(count)
-        total = np.zeros(count)
-        for i, j, distance in rest:
-            for frame in (i, j):
-                total[frame] += 1
-                against[frame] += distance > MAX_DISTANCE_PX
+    while rest.any():
+        total = np.bincount(frames[rest].ravel(), minlength=count)
+        against = np.bincount(frames[rest & contradicts].ravel(), minlength=count)
         share = np.where(total >= 2, against / np.maximum(total, 1), 0)
         worst = int(np.lexsort((against, share))[-1])
         if share[worst] <= 0.5:
             break
-        rest = [pair for pair in rest if worst not in pair[:2]]
-        agree, disagree = sift.votes(
-            worst, sorted(partners[worst] - {*wrong, *untracked})
-        )
-        if agree and agree >= disagree:
-            continue
-        (wrong if agree or disagree else untracked).append(worst)
-    return PoseCheck(
-        np.array(sorted(wrong), np.int64), np.array(sorted(untracked), np.int64)
-    )
+        pairs_of_worst = (frames == worst).any(1)
+        rest &= ~pairs_of_worst
+        partners = np.setdiff1d(frames[pairs_of_worst], [worst, *wrong, *untracked])
+        agree, disagree = sift.votes(worst, partners.tolist())
+        if not agree and not disagree:
+            untracked.append(worst)
+        elif agree < max(disagree, 1):
+            wrong.append(worst)
+    return PoseCheck(np.array(sorted(wrong), int), np.array(sorted(untracked), int))
 
 
 class _SiftCheck:
@@ -126,21 +124,35 @@ class _SiftCheck:
 
     def votes(self, frame: int, partners: Sequence[int]) -> tuple[int, int]:
         """Partners whose matches agree and disagree with the stated poses."""
-        pairs = [
-            pair
-            for pair in (self._pair(frame, j) for j in partners)
-            if pair is not None
-        ]
-        agree = sum(_distance(self.recording, pair) <= MAX_SIFT_PX for pair in pairs)
-        return agree, len(pairs) - agree
+        agree = 0
+        disagree = 0
+        for partner in partners:
+            pair = self._pair(frame, partner)
+            if pair is None:
+                continue
+            if _distance(self.recording, pair) <= MAX_SIFT_PX:
+                agree += 1
+            else:
+                disagree += 1
+        return agree, disagree
 
     def _pair(self, i: int, j: int) -> MatchedPair | None:
         cameras = self.recording.cameras
-        found = epipolar_pair(self._of(i), self._of(j), cameras[i], cameras[j])
-        if found is None:
+        matches = epipolar_pair(
+            self._of(i),
+            self._of(j),
+            cameras[i],
+            cameras[j],
+        )
+        if matches is None:
             return None
-        pixels = self.recording.cell_camera(j).pinhole.project(found.rays[1])
-        return MatchedPair(i, j, found.rays[0], pixels)
+        camera = self.recording.cell_camera(j).pinhole
+        return MatchedPair(
+            i,
+            j,
+            matches.rays[0],
+            camera.project(matches.rays[1]),
+        )
 
     def _of(self, frame: int) -> SiftFeatures:
         if frame not in self._features:
@@ -149,7 +161,9 @@ class _SiftCheck:
 
 
 def depth_scale(
-    recording: PreparedFrames, pairs: list[MatchedPair], metric: bool = True
+    recording: PreparedFrames,
+    pairs: list[MatchedPair],
+    metric: bool = True,
 ) -> float:
     """Estimate the usual depth relative to that in a room; 1 if the range of a room fits.
 
@@ -170,28 +184,38 @@ def scale_of_depths(depth: np.ndarray, metric: bool = True) -> float:
     return 1.0 if usual else float(middle / USUAL_M)
 
 
-def _matched(recording: PreparedFrames, i: int, j: int) -> MatchedPair:
+def _matched(
+    recording: PreparedFrames,
+    i: int,
+    j: int,
+) -> MatchedPair:
     """Mutual best matches of two frames."""
-    a = recording.features(i)[::STRIDE]
-    b = recording.features(j)
-    similar = a @ b.T
+    features = recording.features(i)[::STRIDE]
+    similar = features @ recording.features(j).T
     best = similar.argmax(1)
     back = similar.argmax(0)
-    rows = np.arange(len(a))
+    rows = np.arange(len(features))
     first = similar[rows, best]
     stride = recording.encoder.stride
     camera = recording.cell_camera(i)
     other = recording.cell_camera(j)
-    rows = rows[(back[best] == rows) & (first > MIN_MATCH_SIMILARITY)]
+    mutual = back[best] == rows
+    rows = rows[mutual & (first > MIN_MATCH_SIMILARITY)]
     apart = _apart(other.height // stride, other.width // stride)[best[rows]]
     second = np.where(apart, similar[rows], -1).max(1, initial=-1)
-    rows = rows[1 - first[rows] < RATIO**2 * (1 - second)]
+    distinct = 1 - first[rows] < RATIO**2 * (1 - second)
+    rows = rows[distinct]
     pixels = ideal_cell_pixels(camera, stride)[rows * STRIDE]
     ray = camera.pinhole.unproject(pixels)
     matched = ideal_cell_pixels(other, stride)[best[rows]].astype(np.float64)
     # Near the edge, the distortion can have no ray for a cell.
     valid = np.isfinite(ray).all(1) & np.isfinite(matched).all(1)
-    return MatchedPair(i, j, ray[valid], matched[valid])
+    return MatchedPair(
+        i,
+        j,
+        ray[valid],
+        matched[valid],
+    )
 
 
 @lru_cache(maxsize=4)
@@ -202,28 +226,32 @@ def _apart(rows: int, columns: int) -> BoolArray:
 
 
 def _distance(recording: PreparedFrames, pair: MatchedPair) -> float:
-    other = recording.cell_camera(pair.second)
+    """Median distance of matches from the segments of their rays, pixels."""
+    camera = recording.cell_camera(pair.second)
     scale = recording.depth_scale
     rotation, translation = recording.relative(pair.second, pair.first)
-    start, end = (
-        _pinhole(other, pair.ray @ rotation.T + translation / (scale * depth))
-        for depth in (FAR_M, NEAR_M)
-    )
+    ray = pair.ray @ rotation.T
+    start = _pinhole(camera, ray + translation / (scale * FAR_M))
+    end = _pinhole(camera, ray + translation / (scale * NEAR_M))
     return float(np.median(_segment_distance(pair.pixels, start, end)))
 
 
 def _triangulated(recording: PreparedFrames, pair: MatchedPair) -> Array:
-    other = recording.cell_camera(pair.second)
+    """Depths of matches with clear parallax."""
+    camera = recording.cell_camera(pair.second)
     rotation, translation = recording.relative(pair.second, pair.first)
-    plane = other.pinhole.unproject(pair.pixels)[:, :2]
+    plane = camera.pinhole.unproject(pair.pixels)[:, :2]
     far = pair.ray @ rotation.T
     # The point (far + translation / depth) projects to the match: off + along / depth = 0.
     off = far[:, :2] - plane * far[:, 2:]
     along = translation[:2] - plane * translation[2]
-    inverse = -(off * along).sum(1) / np.maximum((along**2).sum(1), 1e-18)
-    moved = inverse * np.linalg.norm(along, axis=1) * other.fx
-    beside = np.linalg.norm(off + along * inverse[:, None], axis=1) * other.fx
-    return 1 / inverse[(moved > MIN_PARALLAX_PX) & (beside < MAX_EPIPOLAR_PX)]
+    squares = (along**2).sum(1)
+    inverse = -(off * along).sum(1) / np.maximum(squares, 1e-18)
+    moved = inverse * np.linalg.norm(along, axis=1)
+    beside = np.linalg.norm(off + along * inverse[:, None], axis=1)
+    clear = moved * camera.fx > MIN_PARALLAX_PX
+    epipolar = beside * camera.fx < MAX_EPIPOLAR_PX
+    return 1 / inverse[clear & epipolar]
 
 
 def _pinhole(camera: Camera, points: Array) -> Array:
@@ -232,7 +260,11 @@ def _pinhole(camera: Camera, points: Array) -> Array:
     return camera.pinhole.project(np.concatenate([points[:, :2], depth], 1))
 
 
-def _segment_distance(points: Array, start: Array, end: Array) -> Array:
+def _segment_distance(
+    points: Array,
+    start: Array,
+    end: Array,
+) -> Array:
     """Distances (n,) of points (n, 2) from segments between start (n, 2) and end (n, 2)."""
     along = end - start
     length = np.maximum((along**2).sum(1), 1e-12)

@@ -44,7 +44,12 @@ class WorkingSize:
 class PreparedFrames:
     """Posed training frames at working size; poses and camera change during the adjustment."""
 
-    def __init__(self, frames: Sequence[Frame], encoder: Encoder, size: WorkingSize):
+    def __init__(
+        self,
+        frames: Sequence[Frame],
+        encoder: Encoder,
+        size: WorkingSize,
+    ):
         self.frames = tuple(frames)
         self.encoder = encoder
         self.size = size
@@ -135,10 +140,21 @@ class PreparedFrames:
         others = [self.posed_cells(j) for j in near]
         return inverse_depths(view, others, guess, self.depth_scale), near
 
-    def source_views(self, depth_m: Array, view: PosedCells, count: int) -> list[int]:
+    def source_views(
+        self,
+        depth_m: Array,
+        view: PosedCells,
+        count: int,
+    ) -> list[int]:
         """Frames that show the surfaces of a view, see `select_source_views`."""
         cameras = [self.cell_camera(j) for j in range(len(self))]
-        return select_source_views(depth_m, view, self.poses, cameras, count)
+        return select_source_views(
+            depth_m,
+            view,
+            self.poses,
+            cameras,
+            count,
+        )
 
     def pyramid(self, i: int) -> list[np.ndarray]:
         """Image pyramid of a frame."""

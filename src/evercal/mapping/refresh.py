@@ -163,7 +163,11 @@ class _Survival:
         return float(self.alive[self.checked].mean())
 
 
-def _reopened(prepared: PreparedFrames, old: Keyframes, i: int) -> KeyframeTracks:
+def _reopened(
+    prepared: PreparedFrames,
+    old: Keyframes,
+    i: int,
+) -> KeyframeTracks:
     landmarks = old.landmarks[i]
     return KeyframeTracks(
         frame=i,
@@ -198,14 +202,23 @@ def _survival(
         similar = visible[(rays * points).sum(1) > least * lengths]
         if len(similar):
             expected[similar] += 1
-            found = observe(prepared, keyframe, j, similar, WIDE_STEPS, REACH_PX)
+            found = observe(
+                prepared,
+                keyframe,
+                j,
+                similar,
+                WIDE_STEPS,
+                REACH_PX,
+            )
             observed[found.landmark] += 1
     checked = (expected >= options.looks) | (observed > 0)
     return _Survival(checked, ~checked | (observed > 0))
 
 
 def _selected(
-    poses: SE3, shares: Array, options: RefreshOptions
+    poses: SE3,
+    shares: Array,
+    options: RefreshOptions,
 ) -> tuple[list[int], list[int]]:
     """Return the old keyframes that stay and the new images that become keyframes.
 
@@ -237,7 +250,11 @@ def _selected(
     return kept.tolist(), pool[chosen[chosen >= len(kept)]].tolist()
 
 
-def _nearest(poses: SE3, kept: list[int], images: list[int]) -> dict[int, int]:
+def _nearest(
+    poses: SE3,
+    kept: list[int],
+    images: list[int],
+) -> dict[int, int]:
     """Return for each kept keyframe the new image next to it, each image at most once.
 
     Images farther away than the usual step between keyframes replace none.
@@ -257,7 +274,11 @@ def _nearest(poses: SE3, kept: list[int], images: list[int]) -> dict[int, int]:
     return nearest
 
 
-def _distances(space: PoseSpace, rows: Iterable[int], columns: IntArray) -> Array:
+def _distances(
+    space: PoseSpace,
+    rows: Iterable[int],
+    columns: IntArray,
+) -> Array:
     """(r, c) distances between frames."""
     distances = [space.distances(int(i), columns) for i in rows]
     return np.reshape(distances, (-1, len(columns)))
@@ -292,7 +313,9 @@ def _adjust(
 
 
 def _without_gone(
-    old: Keyframes, kept: list[int], survivals: list[_Survival]
+    old: Keyframes,
+    kept: list[int],
+    survivals: list[_Survival],
 ) -> Keyframes:
     """The kept keyframes without the landmarks that are gone."""
     remaining = old.take(np.array(kept, np.int64))

@@ -113,7 +113,11 @@ class PoseSpace:
         return angle + np.sqrt((step**2).sum(axis=0))
 
 
-def _accept_until_full(space: PoseSpace, radius: float, capacity: int) -> IntArray:
+def _accept_until_full(
+    space: PoseSpace,
+    radius: float,
+    capacity: int,
+) -> IntArray:
     """Return the frames SARS accepts before its buffer of `capacity` is full."""
     if radius == 0 or capacity == 0:
         return np.arange(min(capacity, len(space)))
@@ -203,7 +207,11 @@ def select_sars(
     return np.sort(frames)
 
 
-def _largest_radius(space: PoseSpace, capacity: int, tolerance: float) -> float:
+def _largest_radius(
+    space: PoseSpace,
+    capacity: int,
+    tolerance: float,
+) -> float:
     wanted = min(capacity, len(space))
     low = 0.0
     high = math.sqrt(3.0) + math.pi * space.rotation_weight + tolerance

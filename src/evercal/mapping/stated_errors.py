@@ -18,6 +18,9 @@ from evercal.mapping.bundle_equations import (
 from evercal.robot.arm_offsets import JointSlopes
 from evercal.typing import Array
 
+LONG_STEP = 4
+"""A gap of the recording is a step longer than this many median ones."""
+
 
 @dataclass(frozen=True, eq=False)
 class Variances:
@@ -120,3 +123,16 @@ class StatedErrors:
         weighted = self.lever * variances.weight[:, None, None]
         scaled = weighted / variances.sigma[:, None] ** 2
         return self.lever.transpose(0, 2, 1) @ scaled
+
+
+def velocity_of(poses: SE3) -> Array:
+    """(n, 6) motion from frame to frame of recorded poses (n,); 0 beside gaps of the recording."""
+    velocity = np.zeros((len(poses), 6))
+    if len(poses) < 3:
+        return velocity
+    steps = (poses[:-1].inverse() @ poses[1:]).log()
+    size = np.linalg.norm(steps, axis=1)
+    smooth = size < LONG_STEP * np.median(size) + 1e-9
+    mean = (steps[:-1] + steps[1:]) / 2
+    velocity[1:-1] = np.where((smooth[:-1] & smooth[1:])[:, None], mean, 0)
+    return velocity

@@ -107,7 +107,9 @@ def open_keyframe(recording: PreparedFrames, frame: int) -> KeyframeTracks:
 
 
 def opened_keyframes(
-    recording: PreparedFrames, frames: Sequence[int], on_progress: OnProgress
+    recording: PreparedFrames,
+    frames: Sequence[int],
+    on_progress: OnProgress,
 ) -> list[KeyframeTracks]:
     """Open keyframes in parallel and refine their depths."""
 
@@ -125,7 +127,9 @@ def opened_keyframes(
 
 
 def template_patches(
-    recording: PreparedFrames, frame: int, pixels: Array
+    recording: PreparedFrames,
+    frame: int,
+    pixels: Array,
 ) -> tuple[Patches, ...]:
     """Templates around (n, 2) pixels of a frame, in every pyramid level."""
     return tuple(
@@ -178,7 +182,11 @@ def observe(
     which = which[visible]
     templates = tuple(level.take(which) for level in keyframe.patches)
     pixels, correlation = align_down(
-        templates, recording.pyramid(frame), expected, affines, steps
+        templates,
+        recording.pyramid(frame),
+        expected,
+        affines,
+        steps,
     )
     good = correlation > MIN_CORRELATION
     good &= np.linalg.norm(pixels - expected, axis=1) < reach_px
@@ -191,7 +199,9 @@ def observe(
 
 
 def refine_depths(
-    recording: PreparedFrames, keyframe: KeyframeTracks, again: bool = False
+    recording: PreparedFrames,
+    keyframe: KeyframeTracks,
+    again: bool = False,
 ) -> None:
     """Refine the inverse depths of a keyframe's landmarks by Gauss-Newton; poses are fixed.
 
@@ -204,7 +214,14 @@ def refine_depths(
     which = np.arange(len(keyframe.landmarks))
     for steps, updates in _DEPTH_ROUNDS[again:]:
         parts = [
-            observe(recording, keyframe, j, which, steps, REACH_PX)
+            observe(
+                recording,
+                keyframe,
+                j,
+                which,
+                steps,
+                REACH_PX,
+            )
             for j in keyframe.sources
         ]
         observations = joined(parts)
@@ -236,7 +253,9 @@ class _Residuals(NamedTuple):
 
 
 def _residuals(
-    recording: PreparedFrames, keyframe: KeyframeTracks, observations: Observations
+    recording: PreparedFrames,
+    keyframe: KeyframeTracks,
+    observations: Observations,
 ) -> _Residuals:
     rays = recording.cameras[keyframe.frame].unproject(keyframe.landmarks.pixels)
     rho = keyframe.landmarks.inverse_depth
@@ -268,7 +287,9 @@ def _in_front(points: Array) -> Array:
 
 
 def _update_depths(
-    recording: PreparedFrames, keyframe: KeyframeTracks, observations: Observations
+    recording: PreparedFrames,
+    keyframe: KeyframeTracks,
+    observations: Observations,
 ) -> None:
     marks = keyframe.landmarks
     n = len(keyframe.landmarks)

@@ -11,7 +11,7 @@ what the images say: y = d / K has the variance s^2 + v / K.
 import numpy as np
 
 from evercal.geometry import SE3
-from evercal.mapping.bundle_equations import Parameters
+from evercal.mapping.bundle_equations import Linearised, Parameters
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.stated_errors import StatedErrors, Variances
 from evercal.typing import Array
@@ -20,6 +20,10 @@ _COMMON_GROUPS = (slice(0, 3), slice(3, 6))
 """Common translation and rotation: shared parameters that are relevant or not together."""
 _OTHER_GROUPS = (slice(6, 7), slice(-5, -4), slice(-4, -2), slice(-2, None))
 """The same: time shift, focal length, principal point, distortion."""
+MIN_NOISE = 0.02
+"""Lower bound of the standard deviation of whitened residuals."""
+MEDIAN_LENGTH = 1.177
+"""Median length of two Gaussian axes, in standard deviations."""
 RESOLVED_SHARE = 0.03
 """Below this mean share K, errors of stated poses are smaller than what the images resolve."""
 UNRESOLVED_SHRINKAGE = 1.5
@@ -46,8 +50,20 @@ LEAST_SINGULAR = 1e-6
 """Directions with a smaller singular value, as a share of the largest, do not vary."""
 
 
+def noise_of(linearised: Linearised) -> float:
+    """Robust standard deviation of whitened residuals per axis."""
+    squares = (linearised.residual[linearised.valid] ** 2).sum(1)
+    if not len(squares):
+        return MIN_NOISE
+    return max(float(np.sqrt(np.median(squares))) / MEDIAN_LENGTH, MIN_NOISE)
+
+
 def pose_sigma(
-    errors: Array, posterior: Array, weight: Array, sigma: Array, options: BundleOptions
+    errors: Array,
+    posterior: Array,
+    weight: Array,
+    sigma: Array,
+    options: BundleOptions,
 ) -> Array:
     """Standard deviations (6,) of stated poses: the mean of d^2 - v K over that of K^2.
 
@@ -79,7 +95,11 @@ def pose_sigma(
     return estimated.clip(np.repeat(least, 3), np.repeat(most, 3))
 
 
-def student_weights(errors: Array, sigma: Array, tail: float) -> Array:
+def student_weights(
+    errors: Array,
+    sigma: Array,
+    tail: float,
+) -> Array:
     """Weights (n,) of stated poses whose errors (n, 6) have a Student distribution.
 
     (tail + 6) / (tail + |d / s|^2) for six axes and `tail` degrees of freedom.
@@ -112,7 +132,11 @@ def shared_variances(
         groups = _COMMON_GROUPS + groups
     for group in groups:
         variances[group] = group_variance(
-            values[group], posterior[group], prior[group], widest[group], options
+            values[group],
+            posterior[group],
+            prior[group],
+            widest[group],
+            options,
         )
     if joints.stop > joints.start:
         variances[joints] = joint_variance(
@@ -122,7 +146,11 @@ def shared_variances(
 
 
 def group_variance(
-    values: Array, posterior: Array, prior: Array, widest: Array, options: BundleOptions
+    values: Array,
+    posterior: Array,
+    prior: Array,
+    widest: Array,
+    options: BundleOptions,
 ) -> Array:
     """Prior variances (g,) of parameters that are relevant or not together.
 
@@ -140,7 +168,10 @@ def group_variance(
 
 
 def joint_variance(
-    values: Array, posterior: Array, prior: Array, widest: Array
+    values: Array,
+    posterior: Array,
+    prior: Array,
+    widest: Array,
 ) -> Array:
     """Prior variances (k,) of the offsets of an arm's joints: one share of `widest` for all.
 
