@@ -68,12 +68,14 @@ class Arm:
         slopes = np.zeros((len(values), 6, len(self.joints)))
         for joint, base_from_joint in zip(self.chain, frames, strict=False):
             gripper_from_joint = gripper_from_base @ base_from_joint
-            axis = joint.factor * (gripper_from_joint[:, :3, :3] @ joint.axis)
+            rotation = gripper_from_joint[:, :3, :3]
+            position = gripper_from_joint[:, :3, 3]
+            axis = joint.factor * (rotation @ joint.axis)
             slope = slopes[:, :, joint.value]
             if joint.rotates:
                 slope[:, 3:] += axis
                 # The gripper's origin, as seen from the joint, is at minus this position.
-                slope[:, :3] -= np.cross(axis, gripper_from_joint[:, :3, 3])
+                slope[:, :3] -= np.cross(axis, position)
             else:
                 slope[:, :3] += axis
         return slopes

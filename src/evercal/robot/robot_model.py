@@ -71,7 +71,8 @@ class RobotModel:
         )
         self._joint_above = {joint.child: joint for joint in self._joints}
         roots = [link for link in self.links if link not in self._joint_above]
-        self.base_link = [*roots, *self.links][0]
+        roots += self.links
+        self.base_link = roots[0]
 
     def has_joint(self, name: str) -> bool:
         """Whether the URDF has a joint of this name."""
@@ -80,7 +81,9 @@ class RobotModel:
     def rotates(self, name: str) -> bool:
         """Whether a joint exists and its values are angles."""
         joint = self._joint_named.get(name)
-        return joint is not None and joint.type in ("revolute", "continuous")
+        if joint is None:
+            return False
+        return joint.type in ("revolute", "continuous")
 
     def chosen_links(self, base: str | None, gripper: str | None) -> tuple[str, str]:
         """Base and gripper link; if omitted, the root and the only end of the arm."""
@@ -108,13 +111,19 @@ class RobotModel:
         """
         base, gripper = self.chosen_links(base, gripper)
         arm = self.arm(base, gripper)
-        missing = [name for name in arm.joints if name not in names]
+        missing = []
+        columns = []
+        for name in arm.joints:
+            if name in names:
+                columns.append(list(names).index(name))
+            else:
+                missing.append(name)
         if missing:
             raise InputError(
                 f"{source}: no values for joint {', '.join(missing)}, which {gripper} depends on;"
                 f" given are {', '.join(names) or 'none'}"
             )
-        values = values[:, [list(names).index(name) for name in arm.joints]]
+        values = values[:, columns]
         notes = [
             f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
         ]
@@ -132,8 +141,13 @@ class RobotModel:
             raise InputError(
                 f"{self.path}: no joints connect {base} and {gripper}; name others"
             )
-        steps = [(joint, True) for joint in up if joint not in down]
-        steps += [(joint, False) for joint in reversed(down) if joint not in up]
+        steps = []
+        for joint in up:
+            if joint not in down:
+                steps.append((joint, True))
+        for joint in reversed(down):
+            if joint not in up:
+                steps.append((joint, False))
         names: list[str] = []
         chain: list[MovingJoint] = []
         before = np.eye(4)
@@ -174,9 +188,10 @@ class RobotModel:
             step = factor * offsets[name]
             rotates = joint.type != "prismatic"
             weights = (0, step) if rotates else (step, 0)
-            motion = SE3.exp(np.kron(weights, self._axis(joint)))
+            motion = np.kron(weights, self._axis(joint))
             origin = SE3.from_matrix(self._origin(joint))
-            origins[joint.name] = (origin @ motion, rotates)
+            moved = origin @ SE3.exp(motion)
+            origins[joint.name] = (moved, rotates)
         return origins
 
     def _origin(self, joint: Any) -> Array:
@@ -231,7 +246,9 @@ class RobotModel:
     def _beyond_limits(self, name: str, column: Array) -> list[str]:
         """A sentence if values of a joint exceed its limits by 0.1, or two rotations."""
         joint = self._joint_named[name]
-        covered = f"joint {name} goes from {column.min():.2f} to {column.max():.2f}"
+        least = column.min()
+        most = column.max()
+        covered = f"joint {name} goes from {least:.2f} to {most:.2f}"
         if joint.type == "continuous":
             if np.ptp(column) > _LARGEST_RAD:
                 return [f"{covered}, more than two rotations; are these degrees?"]
@@ -240,7 +257,7 @@ class RobotModel:
         upper = getattr(joint.limit, "upper", None)
         if lower is None or upper is None:
             return []
-        if column.min() >= lower - 0.1 and column.max() <= upper + 0.1:
+        if least >= lower - 0.1 and most <= upper + 0.1:
             return []
         return [
             f"{covered}, the URDF allows {lower:.2f} to {upper:.2f}; are the joints in the"
@@ -270,6 +287,6 @@ class RobotModel:
 def _check_origins(tree: Any) -> None:
     """Refuse positions and angles in the XML of a URDF that are not three finite numbers."""
     for text in tree.xpath("/robot/joint/*/@xyz | /robot/joint/*/@rpy"):
-        numbers = [float(word) for word in text.split()]
+        numbers = [*map(float, text.split())]
         if np.isfinite(numbers).sum() != 3:
             raise ValueError(f"'{text}' are not three finite numbers")

@@ -20,6 +20,8 @@ from evercal.typing import Array
 
 Fields = Mapping[str, Any]
 """Values by name."""
+Size = tuple[int, int]
+"""Width and height, pixels."""
 
 
 def _by_alias(table: str) -> dict[str, str]:
@@ -32,10 +34,13 @@ def _by_alias(table: str) -> dict[str, str]:
 
 
 _NAMES = _by_alias("""
-camera_matrix: cameramatrix intrinsicmatrix cameraintrinsics intrinsics intrinsic k mtx
+camera_matrix: cameramatrix intrinsicmatrix mtx k
+camera_matrix: cameraintrinsics intrinsics intrinsic
 camera_matrix: projectionparameters
-distortion_coefficients: distortioncoefficients distortioncoeffs distcoeffs distcoeff distortion
-distortion_coefficients: distortionparameters distortionparams dist coefficients coeffs d kc
+distortion_coefficients: distortioncoefficients distortioncoeffs
+distortion_coefficients: distortionparameters distortionparams
+distortion_coefficients: distcoeffs distcoeff distortion dist
+distortion_coefficients: coefficients coeffs d kc
 image_width: imagewidth width w
 image_height: imageheight height h
 image_size: imagesize imgsize resolution size
@@ -46,10 +51,14 @@ cy: cy ppy
 """)
 """Names of fields by their aliases."""
 _MODELS = {"": "brown"} | _by_alias("""
-brown: plumbbob rationalpolynomial brownconrady radtan radialtangential opencv fullopencv pinhole
-brown: perspective rectified
+brown: plumbbob rationalpolynomial
+brown: brownconrady radtan radialtangential
+brown: opencv fullopencv
+brown: pinhole perspective rectified
 none: none null
-fisheye: equidistant equi fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8
+fisheye: fisheye opencvfisheye
+fisheye: equidistant equi
+fisheye: kannalabrandt kannalabrandt4 kannalabrandt8
 fov: fov atan
 omni: omni
 eucm: eucm
@@ -71,12 +80,28 @@ _UNIQUE = {*_NAMES.values(), *_PINHOLE}
 """Fields that may be stated once."""
 _LENGTHS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
 """Numbers of coefficients that a model may have."""
-_CAMERA_INFO = {"rectificationmatrix", "projectionmatrix", "header", "roi"}
+_CAMERA_INFO = {
+    "rectificationmatrix",
+    "projectionmatrix",
+    "header",
+    "roi",
+}
 """Names of fields of ROS."""
-_RECTIFIED = {"p", "r"}
+_RECTIFIED = {
+    "p",
+    "r",
+}
 """Names of the matrices of ROS for rectified images."""
-_MODIFIERS = {"binningx", "binningy", "fisheyemodel"}
-_KNOWN = {*_NAMES.values(), *DISTORTION, *_MODEL_NAMES, *_CAMERA_INFO, *_MODIFIERS}
+_KNOWN = {
+    *_NAMES.values(),
+    *DISTORTION,
+    *_MODEL_NAMES,
+    *_CAMERA_INFO,
+    "binningx",
+    "binningy",
+    "fisheyemodel",
+}
+"""Names of fields that are used, or that may be left out."""
 _HARMLESS = re.compile(
     r"error|rms|repro|resid|std|dev|sigma|covar|uncert|fps|rate|freq|square|board|marker|pattern"
     r"|chess|tag|count|num|frames|images|views|points|flags|date|time|stamp|version|serial|index"
@@ -100,16 +125,18 @@ def field_name(key: object) -> str:
 
 def named_fields(data: Fields) -> dict[str, Any]:
     """Values by `field_name`; ValueError if two keys are the same field."""
-    keys: dict[str, str] = {}
+    keys = {}
+    fields = {}
     for key in data:
         name = field_name(key)
         if name in keys and name in _UNIQUE:
             raise ValueError(f"{keys[name]} and {key} are the same; keep one of them")
         keys[name] = key
-    return {name: data[key] for name, key in keys.items()}
+        fields[name] = data[key]
+    return fields
 
 
-def camera_of(data: Fields, size: tuple[int, int] | None) -> Camera:
+def camera_of(data: Fields, size: Size | None) -> Camera:
     """One camera from its fields.
 
     `size` is (width, height) in pixels of images, for fields without a size. ValueError: they are
@@ -128,7 +155,8 @@ def camera_of(data: Fields, size: tuple[int, int] | None) -> Camera:
     for kind in models:
         if kind in RADIAL_MODELS:
             return _of_radial_model(kind, fields, _size(fields, data, size))
-    is_ros = not (_CAMERA_INFO | _RECTIFIED).isdisjoint(map(_plain, data))
+    plain = {*map(_plain, data)}
+    is_ros = bool(plain & (_CAMERA_INFO | _RECTIFIED))
     model = "pinhole"
     if "fisheye" in models or fields.get("fisheyemodel"):
         model = "fisheye"
@@ -158,7 +186,8 @@ def camera_of(data: Fields, size: tuple[int, int] | None) -> Camera:
 
 def _model_kind(model: object) -> str:
     """A value of `_MODELS`; `zero` for models that are read without distortion only, else empty."""
-    plain = re.sub(r"[\s_-]", "", str(model).rpartition(".")[2].lower())
+    _, _, name = str(model).rpartition(".")
+    plain = re.sub(r"[\s_-]", "", name.lower())
     kind = _MODELS.get(plain, "")
     if not kind and "conrady" in plain:
         # RealSense prints distortion.inverse_brown_conrady, mostly with zeros.
@@ -170,25 +199,28 @@ def _of_radial_model(kind: str, fields: Fields, size: tuple[Any, Any]) -> Camera
     """As Kalibr states it: parameters before the focal lengths, or the one of `fov` after them."""
     numbers = numbers_of(fields.get("camera_matrix"), "intrinsics")
     name = "distortion_coefficients"
-    distortion = numbers_of(fields.get(name, []), name)
+    values = fields.get(name, [])
+    distortion = numbers_of(values, name)
     if kind == "fov":
         numbers = [*distortion, *numbers]
         distortion = []
     names = (*RADIAL_MODELS[kind].parameters, "fx", "fy", "cx", "cy")
     if len(numbers) != len(names) or any(distortion):
+        expected = f"a camera of model {kind} has {', '.join(names)}"
         raise ValueError(
-            f"a camera of model {kind} has {', '.join(names)} and no other distortion, got"
-            f" {numbers} and {distortion}; rectify the images or calibrate an equidistant model"
+            f"{expected} and no other distortion, got {numbers} and {distortion}; rectify the"
+            f" images or calibrate an equidistant model"
         )
     *parameters, fx, fy, cx, cy = numbers
-    pixels = (int(size[0]), int(size[1]))
-    return nearest_fisheye(kind, parameters, pixels, (fx, fy), (cx, cy))
+    width, height = map(int, size)
+    return nearest_fisheye(kind, parameters, (width, height), (fx, fy), (cx, cy))
 
 
 def _distortion(fields: Fields, model: str) -> tuple[float, ...] | None:
     """Coefficients in OpenCV's order; None if there is no field of them."""
     names = COEFFICIENTS[model]
-    others = [name for name in _PINHOLE if fields.get(name) and name not in names]
+    stated = [name for name in _PINHOLE if fields.get(name)]
+    others = [name for name in stated if name not in names]
     if others:
         raise ValueError(
             f"a fisheye has {', '.join(names)}, got {', '.join(others)}; leave others out"
@@ -206,7 +238,8 @@ def _distortion(fields: Fields, model: str) -> tuple[float, ...] | None:
     else:
         return None
     # Longer models add terms that are mostly zero and can then be dropped.
-    while len(numbers) not in _LENGTHS[model] and numbers[-1] == 0:
+    lengths = _LENGTHS[model]
+    while len(numbers) not in lengths and numbers[-1] == 0:
         numbers.pop()
     return tuple(numbers)
 
@@ -215,10 +248,12 @@ def _refuse_other_models(
     models: Mapping[str, object], distortion: tuple[float, ...]
 ) -> None:
     """Refuse models other than OpenCV's, which `none` and `zero` are without coefficients."""
-    for kind in models.keys() - {"brown", "fisheye"}:
+    for kind, model in models.items():
+        if kind in ("brown", "fisheye"):
+            continue
         if not kind or any(distortion):
             raise ValueError(
-                f"distortion_model {models[kind]!r} is not supported with the coefficients"
+                f"distortion_model {model!r} is not supported with the coefficients"
                 f" {[*distortion]}; rectify the images or calibrate with plumb_bob"
             )
 
@@ -228,13 +263,21 @@ def _matrix(fields: Fields, data: Fields) -> Array:
     names = ("fx", "fy", "cx", "cy")
     if "camera_matrix" in fields:
         numbers = numbers_of(fields["camera_matrix"], "camera_matrix")
-        # As Kalibr writes it; other orders differ in the first two.
-        if len(numbers) == 4 and 0.8 * numbers[1] < numbers[0] < 1.25 * numbers[1]:
-            return _matrix_of(*numbers)
-        if len(numbers) == 16 and numbers[3::4] == numbers[12:] == [0, 0, 0, 1]:
-            numbers = np.reshape(numbers, (4, 4))[:3, :3].ravel().tolist()
-        matrix = np.reshape(numbers_of(numbers, "camera_matrix", 9), (3, 3))
-        if matrix[2, :2].any() and not matrix[:2, 2].any():
+        if len(numbers) == 4:
+            fx, fy, cx, cy = numbers
+            # As Kalibr writes it; other orders differ in the first two.
+            if 0.8 * fy < fx < 1.25 * fy:
+                return _matrix_of(fx, fy, cx, cy)
+        if len(numbers) == 16:
+            whole = np.reshape(numbers, (4, 4))
+            last = [0, 0, 0, 1]
+            if numbers[12:] == last and numbers[3::4] == last:
+                numbers = whole[:3, :3].ravel().tolist()
+        numbers = numbers_of(numbers, "camera_matrix", 9)
+        matrix = np.reshape(numbers, (3, 3))
+        last_row = matrix[2, :2]
+        last_column = matrix[:2, 2]
+        if last_row.any() and not last_column.any():
             return matrix.T  # Open3D writes it column after column.
         return matrix
     missing = [name for name in names if name not in fields]
@@ -242,19 +285,22 @@ def _matrix(fields: Fields, data: Fields) -> Array:
         problem = "'camera_matrix' is missing"
         if len(missing) < len(names):
             problem = f"camera {missing[0]!r} is missing"
-        raise ValueError(f"{problem}, there is {_keys(data) or 'nothing'}; {EXPECTED}")
-    return _matrix_of(
-        *numbers_of([fields[name] for name in names], "fx, fy, cx, cy", 4)
-    )
+        stated = _keys(data) or "nothing"
+        raise ValueError(f"{problem}, there is {stated}; {EXPECTED}")
+    values = [fields[name] for name in names]
+    return _matrix_of(*numbers_of(values, "fx, fy, cx, cy", 4))
 
 
 def _matrix_of(fx: float, fy: float, cx: float, cy: float) -> Array:
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    matrix = np.eye(3)
+    matrix[0, 0] = fx
+    matrix[1, 1] = fy
+    matrix[0, 2] = cx
+    matrix[1, 2] = cy
+    return matrix
 
 
-def _size(
-    fields: Fields, data: Fields, size: tuple[int, int] | None
-) -> tuple[Any, Any]:
+def _size(fields: Fields, data: Fields, size: Size | None) -> tuple[Any, Any]:
     """Width and height in pixels, or `size` if no field states either."""
     missing = [name for name in ("image_width", "image_height") if name not in fields]
     stated = fields.get("image_size")
@@ -281,41 +327,50 @@ def _refuse_unknown(data: Fields) -> None:
             continue
         if isinstance(value, Mapping):
             value = value.get("data")
-        cells = np.ravel(np.array(value, dtype=object)).tolist()
-        numeric = all(map(is_number, cells))
-        if numeric and any(map(float, cells)) and not _is_matrix(key, value, cells):
-            raise ValueError(
-                f"{key!r} is not known and may change the image; name distortion k1, k2, p1, p2,"
-                f" k3, or distortion_coefficients in this order, and leave other numbers out"
-            )
+        array = np.array(value, dtype=object)
+        cells = np.ravel(array).tolist()
+        if not all(map(is_number, cells)) or not any(map(float, cells)):
+            continue
+        if _is_matrix(key, value, len(cells)):
+            continue
+        raise ValueError(
+            f"{key!r} is not known and may change the image; name distortion k1, k2, p1, p2, k3, or"
+            f" distortion_coefficients in this order, and leave other numbers out"
+        )
 
 
-def _is_matrix(key: object, value: object, cells: list[Any]) -> bool:
+def _is_matrix(key: object, value: object, count: int) -> bool:
     """Whether numbers are a 3x3 or 4x4 matrix, or P of ROS, or another one in rows."""
-    if len(cells) in (9, 16):
+    if count in (9, 16):
         return True
-    if len(cells) == 12 and _plain(key) == "p":
+    if count == 12 and _plain(key) == "p":
         return True
     if not isinstance(value, list) or len(value) < 3:
         return False
-    return all(np.size(row) > 2 for row in value)
+    return min(map(np.size, value)) > 2
 
 
 def _binned(camera: Camera, fields: Fields) -> Camera:
     """The camera of combined pixels: ROS states intrinsics and size of the sensor before that."""
     across = max(1, int(fields.get("binningx") or 1))
     down = max(1, int(fields.get("binningy") or 1))
-    return camera.resized(camera.width // across, camera.height // down)
+    width = camera.width // across
+    height = camera.height // down
+    return camera.resized(width, height)
 
 
 def _refuse_misfit(camera: Camera) -> None:
     """Refuse short focal lengths, and principal points outside of the image."""
-    inside = 0 <= camera.cx <= camera.width and 0 <= camera.cy <= camera.height
-    if inside and min(camera.fx, camera.fy) >= camera.width / 10:
+    focal = min(camera.fx, camera.fy)
+    plausible = focal >= camera.width / 10
+    inside_x = 0 <= camera.cx <= camera.width
+    inside_y = 0 <= camera.cy <= camera.height
+    if plausible and inside_x and inside_y:
         return
+    numbers = f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}"
     raise ValueError(
-        f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g} do not fit"
-        f" {camera.width}x{camera.height} images; give them in pixels and of this image size"
+        f"{numbers} do not fit {camera.width}x{camera.height} images; give them in pixels and of"
+        f" this image size"
     )
 
 
@@ -332,12 +387,16 @@ def numbers_of(value: Any, name: str, count: int | None = None) -> list[float]:
     if isinstance(value, dict):
         value = value.get("data")
     try:
-        if not isinstance(value, list) or any(isinstance(v, bool) for v in value):
+        if not isinstance(value, list):
+            raise TypeError
+        if bool in map(type, value):
             raise TypeError
         # YAML 1.1 reads 1e-05, as written by ROS, as a word.
-        numbers = np.array(value, dtype=np.float64).ravel().tolist()
+        array = np.array(value, dtype=np.float64)
+        numbers = array.ravel().tolist()
     except (TypeError, ValueError):
         raise ValueError(f"'{name}' is a list of numbers, got {value!r}") from None
     if count is not None and len(numbers) != count:
-        raise ValueError(f"{name} has {count} numbers, got {len(numbers)}; {EXPECTED}")
+        problem = f"{name} has {count} numbers, got {len(numbers)}"
+        raise ValueError(f"{problem}; {EXPECTED}")
     return numbers

@@ -15,6 +15,7 @@ from evercal.recordings.cameras.camera_fields import (
     DISTORTION,
     EXPECTED,
     Fields,
+    Size,
     camera_of,
     field_name,
     named_fields,
@@ -27,7 +28,7 @@ _OF_ONE_CAMERA = ("camera_matrix", "fx", "fy", "cx", "cy")
 """Fields that do not hold for the cameras inside an entry."""
 
 
-def read_camera(path: PathLike, size: tuple[int, int] | None = None) -> Camera:
+def read_camera(path: PathLike, size: Size | None = None) -> Camera:
     """Read the intrinsics of one camera.
 
     `size` is (width, height) of the images in pixels, for files without one.
@@ -37,23 +38,24 @@ def read_camera(path: PathLike, size: tuple[int, int] | None = None) -> Camera:
         return camera_from_fields(fields_of(path, size), size)
 
 
-def read_camera_of_size(path: Path, size: tuple[int, int], images: str) -> Camera:
+def read_camera_of_size(path: Path, size: Size, images: str) -> Camera:
     """Read the intrinsics of images of one size; another size is refused."""
     camera = read_camera(path, size)
     check_size(str(path), camera, size, images)
     return camera
 
 
-def check_size(source: str, camera: Camera, size: tuple[int, int], images: str) -> None:
+def check_size(source: str, camera: Camera, size: Size, images: str) -> None:
     """Raise `InputError` if a camera from `source` has another size than its images."""
-    if (camera.width, camera.height) != size:
+    width, height = size
+    if camera.width != width or camera.height != height:
         raise InputError(
             f"{source}: is for images of {camera.width}x{camera.height}, {images} is"
-            f" {size[0]}x{size[1]}; give the intrinsics of this image size with `camera`"
+            f" {width}x{height}; give the intrinsics of this image size with `camera`"
         )
 
 
-def camera_from_fields(data: Fields, size: tuple[int, int] | None = None) -> Camera:
+def camera_from_fields(data: Fields, size: Size | None = None) -> Camera:
     """Build a camera from the fields of a file, or of a ROS message.
 
     The camera may stand inside other fields. Of several, the only one of the images' size is taken.
@@ -70,18 +72,21 @@ def camera_from_fields(data: Fields, size: tuple[int, int] | None = None) -> Cam
                 cameras[name] = camera_of(entry, size)
         else:
             cameras["outside of these"] = camera_of(entry, size)
-    distinct = set(cameras.values())
-    fitting = {c for c in distinct if (c.width, c.height) == size}
+    distinct = set()
+    fitting = set()
+    descriptions = []
+    for name, camera in cameras.items():
+        distinct.add(camera)
+        if (camera.width, camera.height) == size:
+            fitting.add(camera)
+        pixels = f"{camera.width}x{camera.height}"
+        descriptions.append(f"{name} ({pixels}, fx {camera.fx:.1f})")
     choice = fitting or distinct
-    if len(choice) > 1:
-        listed = [
-            f"{name} ({camera.width}x{camera.height}, fx {camera.fx:.1f})"
-            for name, camera in cameras.items()
-        ]
-        raise ValueError(
-            f"holds several cameras: {few(listed)}; give a file of the right one"
-        )
-    return choice.pop()
+    if len(choice) == 1:
+        return choice.pop()
+    raise ValueError(
+        f"holds several cameras: {few(descriptions)}; give a file of the right one"
+    )
 
 
 def _undotted(data: Fields) -> dict[str, Any]:
@@ -92,7 +97,9 @@ def _undotted(data: Fields) -> dict[str, Any]:
         if key == "Camera.type":
             name = "camera_model"
         groups.setdefault(group, {})[name] = value
-    return {**groups.pop(""), **groups.pop("Camera"), **groups}
+    plain = groups.pop("")
+    for_all = groups.pop("Camera")
+    return {**plain, **for_all, **groups}
 
 
 def _entries(data: Fields, around: Fields, name: str) -> Iterator[tuple[str, Fields]]:
@@ -102,14 +109,18 @@ def _entries(data: Fields, around: Fields, name: str) -> Iterator[tuple[str, Fie
     hidden = set(fields)
     if not hidden.isdisjoint(DISTORTION):
         hidden.update(DISTORTION)
-    around = {key: value for key, value in around.items() if key not in hidden}
-    if "fx" in fields or isinstance(fields.get("camera_matrix"), list | dict):
-        yield name, {**around, **data}
+    inherited = {}
+    for key, value in around.items():
+        if key not in hidden:
+            inherited[key] = value
+    matrix = fields.get("camera_matrix")
+    if "fx" in fields or isinstance(matrix, list | dict):
+        yield name, {**inherited, **data}
     for key, value in fields.items():
         if key not in _OF_ONE_CAMERA:
-            around[key] = value
+            inherited[key] = value
     for inner, entry in _inside(data, name):
-        yield from _entries(entry, around, inner)
+        yield from _entries(entry, inherited, inner)
 
 
 def _ungrouped(data: Fields) -> dict[str, Any]:
@@ -135,7 +146,7 @@ def _inside(data: Fields, name: str) -> Iterator[tuple[str, Fields]]:
                     yield f"{inner}[{i}]", entry
 
 
-def fields_of(path: Path, size: tuple[int, int] | None = None) -> Fields:
+def fields_of(path: Path, size: Size | None = None) -> Fields:
     """Entries of a camera file, as written; ValueError for other files.
 
     A focal length alone has its principal point in the middle of images of `size`.
@@ -147,15 +158,16 @@ def fields_of(path: Path, size: tuple[int, int] | None = None) -> Fields:
     text = read_text(path, "camera file")
     words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
     if all(map(is_number, words)):
-        numbers = [float(word) for word in words]
+        numbers = [*map(float, words)]
         if len(numbers) == 1 and size is not None:
             numbers = _centred(numbers[0], *size)
         return {"camera_matrix": numbers}
     try:
         if "<opencv_storage" in text:
             return _of_xml(text)
+        is_json = text.lstrip().startswith("{")
         # A printed message ends with '---', which opens a second, empty document.
-        data = next(iter(documents(text, text.lstrip().startswith("{"))), None)
+        data, *_ = [*documents(text, is_json), None]
     except ValueError as error:
         raise ValueError(f"{error}; {EXPECTED}") from None
     if not isinstance(data, dict):
@@ -187,14 +199,15 @@ def _xml_value(element: Any) -> Any:
     if data is not None:
         return {"data": (data.text or "").split()}
     if len(element):
-        values = [(child.tag, _xml_value(child)) for child in element]
-        if values[0][0] == "_":
-            return [value for _, value in values]
-        return dict(values)
+        values = [*map(_xml_value, element)]
+        tags = [child.tag for child in element]
+        if tags[0] == "_":
+            return values
+        return dict(zip(tags, values, strict=True))
     words = (element.text or "").split()
     if not words or not all(map(is_number, words)):
         return " ".join(words)
-    numbers = [float(word) for word in words]
+    numbers = [*map(float, words)]
     if len(numbers) == 1:
         return numbers[0]
     return numbers

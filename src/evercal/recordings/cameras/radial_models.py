@@ -31,7 +31,9 @@ class RadialModel(NamedTuple):
 def _fov(angle: Array, omega: float) -> Array:
     if not omega:
         return np.tan(angle)
-    return np.arctan(2 * np.tan(angle) * np.tan(omega / 2)) / omega
+    half = np.tan(omega / 2)
+    tangent = 2 * np.tan(angle) * half
+    return np.arctan(tangent) / omega
 
 
 def _omni(angle: Array, xi: float) -> Array:
@@ -41,15 +43,18 @@ def _omni(angle: Array, xi: float) -> Array:
 def _eucm(angle: Array, alpha: float, beta: float) -> Array:
     cosine = np.cos(angle)
     sine = np.sin(angle)
-    distance = np.sqrt(beta * sine**2 + cosine**2)
-    return sine / (alpha * distance + (1 - alpha) * cosine)
+    squared = beta * sine**2 + cosine**2
+    distance = np.sqrt(squared)
+    depth = alpha * distance + (1 - alpha) * cosine
+    return sine / depth
 
 
 def _ds(angle: Array, xi: float, alpha: float) -> Array:
     sine = np.sin(angle)
     shifted = xi + np.cos(angle)
     distance = np.sqrt(sine**2 + shifted**2)
-    return sine / (alpha * distance + (1 - alpha) * shifted)
+    depth = alpha * distance + (1 - alpha) * shifted
+    return sine / depth
 
 
 RADIAL_MODELS = {
@@ -64,9 +69,9 @@ RADIAL_MODELS = {
 def nearest_fisheye(
     name: str,
     parameters: Sequence[float],
-    size: tuple[int, int],
-    focal: tuple[float, float],
-    centre: tuple[float, float],
+    size: Sequence[int],
+    focal: Sequence[float],
+    centre: Sequence[float],
 ) -> Camera:
     """The fisheye that is nearest to a model of `RADIAL_MODELS`, by least squares.
 
@@ -76,21 +81,27 @@ def nearest_fisheye(
         ValueError: No fisheye is within `MAX_ERROR_PX`.
     """
     radius = RADIAL_MODELS[name].radius
-    corner = np.maximum(centre, np.array(size) - 1 - centre) / focal
-    largest = np.hypot(*corner) * 1.01
+    last_pixel = np.array(size) - 1
+    corner = np.maximum(centre, last_pixel - centre)
+    largest = np.hypot(*(corner / focal)) * 1.01
     angles = np.deg2rad(np.linspace(0.05, FISHEYE_DEG, 400))
     radii = radius(angles, *parameters)
-    rising = np.cumprod(np.diff(radii, append=np.inf) > 0).astype(bool)
+    steps = np.diff(radii, append=np.inf)
+    rising = np.logical_and.accumulate(steps > 0)
     in_image = rising & np.isfinite(radii) & (radii <= largest)
     angles = angles[in_image]
     radii = radii[in_image]
     powers = angles[:, None] ** np.arange(1, 10, 2)
     terms = np.linalg.lstsq(powers, radii, rcond=None)[0]
-    error = np.abs(powers @ terms - radii).max() * max(focal)
+    residuals = powers @ terms - radii
+    error = np.abs(residuals).max() * max(focal)
     if not error < MAX_ERROR_PX:
         raise ValueError(
             f"no fisheye is nearer than {error:.1f} px to this {name} model"
         )
-    fx, fy = terms[0] * np.array(focal)
-    distortion = tuple(terms[1:] / terms[0])
-    return Camera(*size, fx, fy, *centre, distortion, "fisheye")
+    scale = terms[0]
+    width, height = size
+    fx, fy = scale * np.array(focal)
+    cx, cy = centre
+    distortion = tuple(terms[1:] / scale)
+    return Camera(width, height, fx, fy, cx, cy, distortion, "fisheye")

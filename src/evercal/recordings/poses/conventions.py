@@ -314,7 +314,8 @@ def _check_lengths(lengths: Array, convention: PoseConvention) -> None:
     """Refuse distances (n,) from the base that arms do not have."""
     metres = lengths * convention.metres_per_unit
     far = metres > _MAX_REACH_M
-    near = (metres > 0) & (metres < _MIN_REACH_M) & (convention.metres_per_unit < 1.0)
+    near = (metres > 0) & (metres < _MIN_REACH_M)
+    near &= convention.metres_per_unit < 1.0
     odd = far if far.any() else near
     usual = metres[~odd]
     median = float(np.median(usual)) if len(usual) else 0.0
@@ -335,7 +336,8 @@ def _check_lengths(lengths: Array, convention: PoseConvention) -> None:
 def _other_unit(unit: str, problem: str, convention: PoseConvention) -> ConventionError:
     """An error that offers the convention in a likely unit, and in the other one."""
     other = _OTHER_UNIT[unit]
-    words = [word for word in convention.name.split(":") if word not in (unit, other)]
+    words = convention.name.split(":")
+    words = [word for word in words if word not in (unit, other)]
     base = ":".join(words)
     remedy = f"{base}:{unit} (or {base}:{other} if the unit is right as it is)"
     return ConventionError(f"{problem} {_UNIT_NAMES[unit]}", remedy)
@@ -359,20 +361,24 @@ def _rotations(numbers: Array, convention: PoseConvention) -> Rotation:
 
 def _matrices(numbers: Array, layout: str) -> Array:
     """(..., 3 or 4, 4) matrices of numbers (..., 12 or 16)."""
-    height = numbers.shape[-1] // 4
+    *shape, count = numbers.shape
+    height = count // 4
     if layout == "rows":
-        return numbers.reshape(*numbers.shape[:-1], height, 4)
-    return np.swapaxes(numbers.reshape(*numbers.shape[:-1], 4, height), -1, -2)
+        return numbers.reshape(*shape, height, 4)
+    columns = numbers.reshape(*shape, 4, height)
+    return np.swapaxes(columns, -1, -2)
 
 
 def _rigid(matrices: Array) -> BoolArray:
     """(...) whether matrices (..., 3 or 4, 4) are rigid transforms."""
     block = matrices[..., :3, :3]
     gram = np.swapaxes(block, -1, -2) @ block
-    drift = np.abs(gram - np.eye(3)).max((-1, -2), initial=0.0)
-    last_row = matrices[..., 3:, :]
-    scale = np.abs(last_row - (0.0, 0.0, 0.0, 1.0)).max((-1, -2), initial=0.0)
-    return (drift < _TOLERANCE) & (np.linalg.det(block) > 0) & (scale < 1e-6)
+    drift = np.abs(gram - np.eye(3))
+    orthogonal = drift.max((-1, -2), initial=0.0) < _TOLERANCE
+    proper = np.linalg.det(block) > 0
+    drift = np.abs(matrices[..., 3:, :] - (0.0, 0.0, 0.0, 1.0))
+    homogeneous = drift.max((-1, -2), initial=0.0) < 1e-6
+    return orthogonal & proper & homogeneous
 
 
 def _from_matrices(numbers: Array, convention: PoseConvention) -> SE3:
@@ -385,8 +391,10 @@ def _from_matrices(numbers: Array, convention: PoseConvention) -> SE3:
         order = "row after row"
     matrices = _matrices(numbers, convention.layout)
     broken = ~_rigid(matrices)
-    if broken.any() and _rigid(_matrices(numbers, CONVENTIONS[other].layout)).all():
-        remedy = ":".join([other, *convention.name.split(":")[1:]])
+    transposed = _matrices(numbers, CONVENTIONS[other].layout)
+    if broken.any() and _rigid(transposed).all():
+        _, *modifiers = convention.name.split(":")
+        remedy = ":".join([other, *modifiers])
         raise ConventionError(f"the matrices are written {order}", remedy)
     _refuse(
         broken,
@@ -402,5 +410,8 @@ def _refuse(broken: ArrayLike, reason: str) -> None:
     indices = np.flatnonzero(broken)
     if not len(indices):
         return
-    more = f" (and {len(indices) - 1} more)" if len(indices) > 1 else ""
-    raise ValueError(f"pose {indices[0] + 1}{more}: {reason}")
+    first, *others = indices + 1
+    pose = f"pose {first}"
+    if others:
+        pose += f" (and {len(others)} more)"
+    raise ValueError(f"{pose}: {reason}")

@@ -233,4 +233,6 @@ def _image_times(
 
 
 def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+    if number != 1:
+        what += "s"
+    return f"{number} {what}"

@@ -104,8 +104,19 @@ def _grid(digits: str) -> list[str]:
 
 _GRID = _grid("0123")
 _DOWN = np.arange(16).reshape(4, 4).T.ravel().astype(str).tolist()
-_ANGLES = ("ur", "yaskawa", "staubli", "fanuc", "rpy")
-_ORDERS = ("abb", "wxyz", "xyzw", "tum")
+_ANGLES = (
+    "ur",
+    "yaskawa",
+    "staubli",
+    "fanuc",
+    "rpy",
+)
+_ORDERS = (
+    "abb",
+    "wxyz",
+    "xyzw",
+    "tum",
+)
 _Q = "q,q_,quat,quat_,quaternion_,orientation_,rotation_,q_rs_"
 _R = "r,r_,rot_,rotation_"
 HEADERS = {

@@ -40,7 +40,15 @@ Columns = Mapping[str, Any]
 Shape = tuple[int, ...]
 """Lengths of nested lists."""
 
-_KEYS = ("poses", "T", "transforms", "matrices", "samples", "pose", "matrix")
+_KEYS = (
+    "poses",
+    "T",
+    "transforms",
+    "matrices",
+    "samples",
+    "pose",
+    "matrix",
+)
 """Keys of poses of anything."""
 _CAMERA = (
     "camera_from_board|camera_poses?|tracking|optical|board|marker|target2cam|object_wrt_sensor"
@@ -95,13 +103,17 @@ def pose_data(data: Any, given: Given, robot: bool = True) -> PoseTable:
     data = _plain(data)
     if isinstance(data, Mapping):
         return _of_object(data, given, robot)
-    if not isinstance(data, list) or len({*map(_is_object, data)}) != 1:
+    kinds = set()
+    if isinstance(data, list):
+        kinds = {*map(_is_object, data)}
+    if len(kinds) != 1:
         raise ValueError(
             "poses are a list of objects, or of lists of numbers, not of both"
         )
-    if isinstance(data[0], Mapping):
+    if True in kinds:
         return _of_objects(data, given, robot)
-    numbers = _poses_first(number_array(data, "a list of poses"), _MATRICES)
+    array = number_array(data, "a list of poses")
+    numbers = _poses_first(array, _MATRICES)
     if numbers.shape[-2:] == (6, 1):  # ViSP's vectors of poses
         numbers = numbers.reshape(-1, 6)
         given = given or pose_convention("ur")
@@ -139,7 +151,7 @@ def _of_objects(entries: list[Any], given: Given, robot: bool) -> PoseTable:
 
 def _of_cells(columns: Columns, given: Given) -> PoseTable:
     """Poses whose numbers have a key each, or lists of some of them."""
-    rows = [_cells(row) for row in _rows_of(columns)]
+    rows = [*map(_cells, _rows_of(columns))]
     words = [*dict.fromkeys(chain.from_iterable(rows))]
     require_at_most(len(words) * len(rows), "numbers", "values")
     cells = []
@@ -153,7 +165,8 @@ def _of_object(data: Columns, given: Given, robot: bool) -> PoseTable:
     """Poses of an object: by image or number, under one key, or with their numbers under keys."""
     names = _keys_of_images(data)
     if names:
-        table = pose_data([data[name] for name in names], given, robot)
+        poses = [data[name] for name in names]
+        table = pose_data(poses, given, robot)
         return table._replace(names=tuple(names))
     if robot:
         _refuse_eye_on_base(data, given)
@@ -208,7 +221,9 @@ def _keys_of_images(data: Columns) -> list[str]:
 
 def _refuse_eye_on_base(data: Columns, given: Given) -> None:
     parameters = data.get("parameters")
-    if not isinstance(parameters, Mapping) or (given and given.has("inverse")):
+    if not isinstance(parameters, Mapping):
+        return
+    if given and given.has("inverse"):
         return
     on_base = parameters.get("calibration_type") == "eye_on_base"
     if on_base or parameters.get("eye_on_hand") is False:
@@ -278,7 +293,8 @@ def _of_arrays(columns: Columns, given: Given, plural: bool) -> PoseTable | None
 
 def _are_poses(key: str, shape: Shape, plural: bool) -> bool:
     """Whether an array of a shape holds matrices, or rows of numbers other than joint values."""
-    if shape[-2:] in _MATRICES or shape[:2] in _MATRICES:
+    are_matrices = shape[-2:] in _MATRICES or shape[:2] in _MATRICES
+    if are_matrices:
         return True
     is_table = len(shape) == 2 and shape[1] in _WIDTHS
     return plural and is_table and "joint" not in key.lower()
@@ -333,8 +349,10 @@ def _composed(
 def _rows(array: Array, width: int) -> Array:
     """(n, width) numbers of arrays with an axis too many, or with the poses last as in MATLAB."""
     array = np.squeeze(array)
-    if array.ndim == 2 and array.shape[1] != width == array.shape[0]:
-        array = array.T
+    if array.ndim == 2:
+        height, columns = array.shape
+        if height == width != columns:
+            array = array.T
     return array.reshape(-1, width)
 
 
@@ -406,7 +424,8 @@ def _cells(row: Columns) -> dict[str, object]:
     """One value a column: those of a list are columns of their own."""
     cells: dict[str, object] = {}
     for key, value in row.items():
-        names = _LISTS.get(key) or _QUATERNIONS.get(key[-4:].lower())
+        order = key[-4:].lower()
+        names = _LISTS.get(key) or _QUATERNIONS.get(order)
         values = value
         if not isinstance(value, list):
             values = [value]

@@ -136,7 +136,8 @@ def measured_pairs(
         if vector is not None:
             pairs.append((first, second))
             vectors.append(vector)
-    return np.array(pairs, np.intp).reshape(-1, 2), np.array(vectors)
+    indices = np.array(pairs, np.intp).reshape(-1, 2)
+    return indices, np.array(vectors)
 
 
 def measured_rotation(first: Frame, second: Frame) -> Array | None:
@@ -148,7 +149,10 @@ def measured_rotation(first: Frame, second: Frame) -> Array | None:
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     rows = []
     for nearest, *others in matcher.knnMatch(first_descriptors, second_descriptors, 2):
-        if others and nearest.distance < RATIO * others[0].distance:
+        if not others:
+            continue
+        second_nearest = others[0].distance
+        if nearest.distance < RATIO * second_nearest:
             rows.append((nearest.queryIdx, nearest.trainIdx))
     if len(rows) < MIN_MATCHES:
         return None
@@ -161,10 +165,13 @@ def measured_rotation(first: Frame, second: Frame) -> Array | None:
     matrix, inliers = cv2.findEssentialMat(
         a, b, np.eye(3), cv2.RANSAC, 0.999, threshold
     )
-    if matrix is None or matrix.shape != (3, 3) or int(inliers.sum()) < MIN_MATCHES:
+    if matrix is None or matrix.shape != (3, 3):
         return None
-    _, second_from_first, _, _ = cv2.recoverPose(matrix, a, b, np.eye(3), mask=inliers)
-    return Rotation.from_matrix(second_from_first).inv().as_rotvec()
+    if int(inliers.sum()) < MIN_MATCHES:
+        return None
+    _, matrix, *_ = cv2.recoverPose(matrix, a, b, np.eye(3), mask=inliers)
+    second_from_first = Rotation.from_matrix(matrix)
+    return second_from_first.inv().as_rotvec()
 
 
 def _features(frame: Frame) -> tuple[Array, Float32Array]:
@@ -173,14 +180,16 @@ def _features(frame: Frame) -> tuple[Array, Float32Array]:
     camera = frame.camera
     scale = LONG_SIDE / max(camera.width, camera.height)
     if scale < 1:
-        size = (round(camera.width * scale), round(camera.height * scale))
-        camera = camera.resized(*size)
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        width = round(camera.width * scale)
+        height = round(camera.height * scale)
+        camera = camera.resized(width, height)
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     sift = cv2.SIFT_create(1500)  # pyright: ignore[reportAttributeAccessIssue]
     points, descriptors = sift.detectAndCompute(image, None)
     if descriptors is None:
         return np.empty((0, 2)), np.empty((0, 128), np.float32)
-    rays = camera.unproject([point.pt for point in points])[:, :2]
+    pixels = [point.pt for point in points]
+    rays = camera.unproject(pixels)[:, :2]
     valid = np.isfinite(rays).all(1)
     return rays[valid], descriptors[valid]
 
@@ -193,10 +202,13 @@ def _pairs(poses: SE3) -> list[tuple[int, int]]:
     """
     rotation = poses.rotation
     pairs = []
-    firsts = np.unique(np.linspace(0, len(poses) - 2, PAIRS).round().astype(int))
+    spread = np.linspace(0, len(poses) - 2, PAIRS)
+    firsts = np.unique(spread.round().astype(int))
     for i, first in enumerate(firsts):
-        later = np.arange(first + 1, min(first + 1 + MAX_FRAMES_APART, len(poses)))
-        degrees = np.rad2deg((rotation[first].inv() * rotation[later]).magnitude())
+        end = min(first + 1 + MAX_FRAMES_APART, len(poses))
+        later = np.arange(first + 1, end)
+        difference = rotation[first].inv() * rotation[later]
+        degrees = np.rad2deg(difference.magnitude())
         if i % 2:
             best = np.argmin(np.abs(degrees - BEST_ROTATION_DEG))
         else:

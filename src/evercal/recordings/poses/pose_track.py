@@ -28,7 +28,8 @@ class PoseTrack:
 
     def __post_init__(self) -> None:
         stamps = np.asarray(self.stamps_s, dtype=np.float64)
-        if stamps.ndim != 1 or not stamps.size or stamps.shape != self.poses.shape:
+        shape = stamps.shape
+        if len(shape) != 1 or not stamps.size or shape != self.poses.shape:
             raise ValueError(
                 f"a track takes n >= 1 times and poses, got {stamps.shape}"
             )

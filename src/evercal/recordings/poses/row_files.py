@@ -40,7 +40,14 @@ _NAMES = (
     "name",
     "frame",
 )
-_STAMPS = ("stamp", "timestamp", "time_stamp", "time", "t")
+_STAMPS = (
+    "stamp",
+    "timestamp",
+    "time_stamp",
+    "time",
+    "t",
+)
+"""Names of columns of times, the first of which is used."""
 _UNIT = re.compile(
     r"(?<![\s_/])[\s_/]*[\s_/\[(]\s*(mm|cm|m|inch(?:es)?|(?:milli)?met(?:er|re)s?|deg(?:rees?)?"
     r"|rad(?:ians?)?|ns|us|ms|s)\s*[\])]?$|(?<!\s)\s*\[\s*\]$"
@@ -75,7 +82,8 @@ def read_rows(path: Path, contents: str) -> LabelledRows:
     """Read a table whose first line names the columns; `contents` describes it in messages."""
     text = read_text(path, f"file with {contents}")
     with named_errors(path, contents):
-        cells = table_cells([line for line in text.splitlines() if line[:1] != "#"])
+        lines = [line for line in text.splitlines() if line[:1] != "#"]
+        cells = table_cells(lines)
         header = cells[:1].ravel()
         rows = cells[1:]
         words = header.tolist()
@@ -104,7 +112,9 @@ def table_cells(lines: Sequence[str]) -> Cells:
     if not rows:
         return np.empty((0, 0), dtype=object)
     cells = text_cells([map(str.strip, row) for row in rows])
-    if separator == "," or any(map(_has_point, cells.ravel().tolist())):
+    if separator == ",":
+        return cells
+    if any(map(_has_point, cells.ravel().tolist())):
         return cells  # beside numbers with points, commas are those of thousands
     for index, cell in np.ndenumerate(cells):
         cells[index] = _DECIMAL_COMMA.sub(r"\1.\2", cell)
@@ -150,7 +160,8 @@ def _split(lines: Sequence[str], separator: str) -> list[list[str]]:
                 f"no table: line {reader.line_num} has {len(row)} cells, not {width}"
             )
         if row:
-            rows.append(row + [""] * (width - len(row)))
+            missing = width - len(row)
+            rows.append(row + [""] * missing)
     if rows.pop()[:1] != ["end"]:
         raise ValueError("no table: a quotation mark is not closed")
     return rows
@@ -336,13 +347,16 @@ def _require_few_numbers(file: IO[bytes]) -> None:
         shape, _, dtype = np.lib.format.read_array_header_2_0(file)
     if dtype.hasobject:
         raise ValueError("Python objects; save arrays of numbers")
-    size = math.prod(shape) * max(dtype.itemsize, 8) // 8
+    words = max(dtype.itemsize, 8)
+    size = math.prod(shape) * words // 8
     require_at_most(size, "numbers", "numbers")
 
 
 def in_unit(stamps: Array, unit: str | None = None) -> Array:
     """Convert stamps (n,) to seconds from `s`, `ms`, `us` or `ns`, by their size if omitted."""
-    middle = float(np.median(stamps)) if stamps.size else 0.0
+    middle = 0.0
+    if stamps.size:
+        middle = float(np.median(stamps))
     likely = "s"
     for name, size in _SINCE_1970.items():
         if middle > size:
@@ -354,7 +368,9 @@ def in_unit(stamps: Array, unit: str | None = None) -> Array:
             f"a stamp of {middle:.4g} is not in seconds; call the column stamp_ns, stamp_us or"
             f" stamp_ms"
         )
-    return stamps / _PER_SECOND.get(unit or likely, _PER_SECOND[likely])
+    if unit not in _PER_SECOND:
+        unit = likely
+    return stamps / _PER_SECOND[unit]
 
 
 def is_number(cell: object) -> bool:
