@@ -87,10 +87,7 @@ _CAMERA_INFO = {
     "roi",
 }
 """Names of fields of ROS."""
-_RECTIFIED = {
-    "p",
-    "r",
-}
+_RECTIFIED = {"p", "r"}
 """Names of the matrices of ROS for rectified images."""
 _KNOWN = {
     *_NAMES.values(),

@@ -20,7 +20,8 @@ from evercal.recordings.cameras.camera_fields import (
     field_name,
     named_fields,
 )
-from evercal.recordings.poses.row_files import arrays_as_lists, is_number
+from evercal.recordings.poses.array_files import arrays_as_lists
+from evercal.recordings.poses.row_files import is_number
 from evercal.storage.text_files import documents, few, named_errors, naming, read_text
 from evercal.typing import PathLike
 

@@ -15,6 +15,7 @@ import numpy as np
 from evercal.choices import ConventionName
 from evercal.geometry import SE3
 from evercal.recordings.images import files_in
+from evercal.recordings.poses.array_files import arrays_as_lists
 from evercal.recordings.poses.conventions import (
     Given,
     PoseConvention,
@@ -25,7 +26,7 @@ from evercal.recordings.poses.conventions import (
 from evercal.recordings.poses.pose_columns import PoseTable
 from evercal.recordings.poses.pose_data import pose_data
 from evercal.recordings.poses.pose_table import read_pose_table
-from evercal.recordings.poses.row_files import Names, arrays_as_lists
+from evercal.recordings.poses.row_files import Names
 from evercal.robot.arm import Arm
 from evercal.storage.text_files import (
     documents,

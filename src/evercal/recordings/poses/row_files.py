@@ -6,19 +6,17 @@ have any name. In JSON lists beside the poses, names are in the plural: `images`
 """
 
 import csv
-import math
 import re
-import zipfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PureWindowsPath
-from typing import IO, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evercal.bounds import bounds, require_at_most
 from evercal.recordings.images import IMAGE_ENDINGS
-from evercal.storage.text_files import library_errors, named_errors, read_text
+from evercal.storage.text_files import named_errors, read_text
 from evercal.typing import Array
 
 Cells = NDArray[np.object_]
@@ -301,55 +299,6 @@ def number_array(values: object, what: str) -> Array:
         raise ValueError(
             f"{what} is made of numbers and has the same shape everywhere"
         ) from None
-
-
-def arrays_as_lists(path: Path) -> Any:
-    """An array of NPY as lists, or arrays of NPZ or MAT by name; InputError for damaged files."""
-    with path.open("rb") as file, library_errors(f"{path}: no readable arrays"):
-        if path.suffix.lower() == ".mat":
-            return _matlab(file)
-        if zipfile.is_zipfile(file):
-            with zipfile.ZipFile(file) as archive:
-                for entry in archive.infolist():
-                    with archive.open(entry) as member:
-                        _require_few_numbers(member)
-        else:
-            file.seek(0)
-            _require_few_numbers(file)
-        file.seek(0)
-        loaded = np.load(file, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return loaded.tolist()
-        return {key: loaded[key].tolist() for key in loaded.files}
-
-
-def _matlab(file: IO[bytes]) -> dict[str, Any]:
-    from scipy.io import loadmat, whosmat
-
-    numeric = re.compile("double|single|u?int(8|16|32|64)")
-    names = []
-    count = 0
-    for name, shape, kind in whosmat(file):
-        if numeric.fullmatch(kind):
-            names.append(name)
-            count += math.prod(shape)
-    require_at_most(count, "numbers", "numbers")
-    file.seek(0)
-    loaded = loadmat(file, variable_names=names)
-    return {name: loaded[name].tolist() for name in names}
-
-
-def _require_few_numbers(file: IO[bytes]) -> None:
-    """Check the shape that an array states, before its numbers are read."""
-    if np.lib.format.read_magic(file) == (1, 0):
-        shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-    else:
-        shape, _, dtype = np.lib.format.read_array_header_2_0(file)
-    if dtype.hasobject:
-        raise ValueError("Python objects; save arrays of numbers")
-    words = max(dtype.itemsize, 8)
-    size = math.prod(shape) * words // 8
-    require_at_most(size, "numbers", "numbers")
 
 
 def in_unit(stamps: Array, unit: str | None = None) -> Array:
