@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from evercal.errors import InputError
-from evercal.features.encoder import load_encoder
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization import acceptance
 from evercal.localization.estimate import PoseEstimate
@@ -25,10 +24,7 @@ from evercal.localization.localizer import Localizer
 from evercal.localization.options import Attempt, LocalizeOptions
 from evercal.localization.parallel import in_parallel
 from evercal.localization.pnp import PnpOptions
-from evercal.mapping.build import MapOptions, build_map
 from evercal.mapping.map_frame import MapFrame, Similarity
-from evercal.mapping.memory_budget import MemoryBudget
-from evercal.mapping.prepared_frames import WorkingSize
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.mapping.store import MapStore
 from evercal.recordings.frame import Frame, Recording
@@ -253,21 +249,16 @@ def test_default_camera_is_the_adjusted_one(
     hall_map: MapContents, views: tuple[Frame, ...]
 ) -> None:
     scene = hall_map.scenes[0]
-    camera = views[0].camera
     longer = replace(scene.camera, fx=1.03 * scene.camera.fx, fy=1.03 * scene.camera.fy)
     localizer = Localizer(with_scene(hall_map, replace(scene, adjusted_camera=longer)))
-    asked = cameras_in_scenes(None, views[0].read_image(), localizer.contents.scenes)
-    assert asked == [longer]
-    assert cameras_in_scenes(
-        camera, views[0].read_image(), localizer.contents.scenes
-    ) == [longer]
-    assert cameras_in_scenes(
-        longer, views[0].read_image(), localizer.contents.scenes
-    ) == [longer]
+    image = views[0].read_image()
+    for stated in (None, views[0].camera, longer):
+        cameras = cameras_in_scenes(stated, image, localizer.contents.scenes)
+        assert cameras == [longer]
     # Another scene has its own adjusted camera.
     both = [replace(scene, adjusted_camera=longer), replace(scene, camera=longer)]
     expected = [longer, scene.adjusted_camera]
-    assert cameras_in_scenes(longer, views[0].read_image(), both) == expected
+    assert cameras_in_scenes(longer, image, both) == expected
 
 
 @pytest.mark.parametrize("factor", [0.95, 0.995, 1.02])
@@ -390,30 +381,6 @@ def test_camera_of_another_aspect_ratio_is_refused(localizer: Localizer) -> None
         localizer.localize(image, CAMERA)
     with pytest.raises(InputError, match="image"):
         localizer.localize(image[..., :2])
-
-
-@pytest.fixture(scope="module")
-def two_scenes(arcs: tuple[Recording, Recording]) -> MapContents:
-    """A map of both arcs, whose cameras are the same."""
-    contents = MapContents(load_encoder(), 120)
-    options = MapOptions(MemoryBudget(share=0.5), WorkingSize(cells=120))
-    for arc in arcs:
-        scene = build_map(arc.name, arc.train[::2], contents.encoder, options).scene
-        contents.scenes.append(scene)
-    return contents
-
-
-@pytest.mark.parametrize("candidates", [1, 3])
-def test_images_are_located_in_their_own_scene(
-    candidates: int, two_scenes: MapContents, arcs: tuple[Recording, Recording]
-) -> None:
-    localizer = Localizer(two_scenes, LocalizeOptions(candidates=candidates))
-    assert localizer.scenes == ("one", "two")
-    for arc in arcs:
-        for frame in arc.test[2::8]:
-            estimate = localizer.localize(frame.read_image())
-            assert estimate.scene == arc.name
-            assert error(estimate, frame.base_from_camera)[0] < 0.03
 
 
 def test_a_wider_attempt_locates_what_the_first_rejects(
