@@ -253,7 +253,6 @@ def test_a_kill_at_any_step_leaves_the_old_state_or_the_new_one(
     action: str,
     root: Path,
     other: Path,
-    tmp_path: Path,
     every_step: Record,
     tree: Tree,
     content: Contents,
@@ -273,7 +272,8 @@ def test_a_kill_at_any_step_leaves_the_old_state_or_the_new_one(
             else None
         )
 
-    where = tmp_path / "new" if action == "merge into new" else root
+    folder = other.parent
+    where = folder / "new" if action == "merge into new" else root
     before = state(where)
     snapshots = every_step(where, lambda: change(where))
     after = state(where)
@@ -284,7 +284,7 @@ def test_a_kill_at_any_step_leaves_the_old_state_or_the_new_one(
     assert all(outcome == after for outcome in outcomes[first:])
     assert first > 0
     for i in {0, first // 2, first - 1}:
-        again = tmp_path / "again" / str(i)
+        again = folder / "again" / str(i)
         if snapshots[i].exists():
             shutil.copytree(snapshots[i], again)
         change(again)
