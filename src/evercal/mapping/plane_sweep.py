@@ -187,12 +187,7 @@ class _SourceView:
             image = self.similarity[block].reshape(-1, self.columns)
             below = down[block]
             below = below + tops[: len(below)]
-            sampled[block] = cv2.remap(
-                image,
-                right[block],
-                below,
-                cv2.INTER_LINEAR,
-            )
+            sampled[block] = cv2.remap(image, right[block], below, cv2.INTER_LINEAR)
         return np.maximum(sampled, 0) * inside
 
     def normal_equation(self, inverse: Array) -> tuple[Array, Array]:

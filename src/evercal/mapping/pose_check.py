@@ -138,21 +138,11 @@ class _SiftCheck:
 
     def _pair(self, i: int, j: int) -> MatchedPair | None:
         cameras = self.recording.cameras
-        matches = epipolar_pair(
-            self._of(i),
-            self._of(j),
-            cameras[i],
-            cameras[j],
-        )
+        matches = epipolar_pair(self._of(i), self._of(j), cameras[i], cameras[j])
         if matches is None:
             return None
         camera = self.recording.cell_camera(j).pinhole
-        return MatchedPair(
-            i,
-            j,
-            matches.rays[0],
-            camera.project(matches.rays[1]),
-        )
+        return MatchedPair(i, j, matches.rays[0], camera.project(matches.rays[1]))
 
     def _of(self, frame: int) -> SiftFeatures:
         if frame not in self._features:
