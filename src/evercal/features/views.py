@@ -99,8 +99,7 @@ def augmented_view(
     zoom = options.zoom ** rng.uniform(-1, 1)
     roll = np.deg2rad(options.roll_deg)
     tilt = np.deg2rad(options.tilt_deg)
-    rotvec = rng.uniform(-1, 1, 3)
-    rotvec = rotvec * [tilt, tilt, roll]
+    rotvec = rng.uniform(-1, 1, 3) * [tilt, tilt, roll]
     tangent = np.array([0, 0, 0, *rotvec])
     rotation = SE3.exp(tangent)
     camera_from_view = rotation.rotation_matrix()
@@ -132,9 +131,7 @@ def augmented_view(
             borderMode=cv2.BORDER_REFLECT,
         )
     exponent = np.exp(rng.normal(0, options.gamma))
-    linear = np.arange(256) / 255.0
-    table = linear**exponent * 255
-    warped = cv2.LUT(warped, table.astype(np.uint8))
+    warped = cv2.LUT(warped, _gamma_table(exponent))
     centres = cell_centres(height, width, stride)
     ray = virtual.unproject(centres) @ camera_from_view.T
     source = camera.project(ray)
@@ -186,6 +183,13 @@ def working_grey(image: Image, short_side: int) -> Image:
     )
     grey, _ = working_image(image, camera, short_side)
     return grey
+
+
+def _gamma_table(exponent: float) -> Image:
+    """(256,) intensities after a change of brightness."""
+    linear = np.arange(256) / 255.0
+    table = linear**exponent * 255
+    return table.astype(np.uint8)
 
 
 def _on_image(plane: Array, camera: Camera) -> Array:
