@@ -16,11 +16,11 @@ from evercal.recordings.poses.conventions import (
     CONVENTIONS,
     VENDORS,
     asking_for,
-    check_units,
     numbers_from_poses,
     pose_convention,
     poses_from_numbers,
 )
+from evercal.recordings.poses.pose_units import check_units
 from evercal.typing import Array
 
 

@@ -13,10 +13,10 @@ from typing import Any, TypeAlias
 from evercal.errors import InputError
 from evercal.recordings.poses.conventions import (
     asking_for,
-    checked_poses,
     pose_convention,
 )
 from evercal.recordings.poses.joint_tables import in_radians, poses_of_arm
+from evercal.recordings.poses.pose_units import checked_poses
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.robot_model import RobotModel

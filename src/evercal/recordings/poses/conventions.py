@@ -22,12 +22,6 @@ from scipy.spatial.transform import Rotation
 from evercal.geometry.se3 import SE3
 from evercal.typing import Array, BoolArray
 
-_MAX_REACH_M = 10.0
-"""Largest distance of a gripper from its base, metres."""
-_MIN_REACH_M = 0.01
-"""Smallest distance of a gripper from its base, metres; at least one pose exceeds it."""
-_MAX_DEG = 361.0
-"""Largest angle, degrees: a rotation, and some rounding."""
 _TOLERANCE = 1e-2
 """Error of a quaternion's length, or of R^T R, if printed with three digits."""
 _OPENGL_FROM_OPENCV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
@@ -162,10 +156,6 @@ UNITS: dict[str, dict[str, Any]] = {
 """What a unit changes of a convention."""
 
 
-_UNIT_NAMES = {"m": "metres", "mm": "millimetres", "rad": "radians", "deg": "degrees"}
-_OTHER_UNIT = {"m": "mm", "mm": "m", "rad": "deg", "deg": "rad"}
-
-
 def pose_convention(name: str) -> PoseConvention:
     """Parse the name of a convention with modifiers, such as `kuka:m:inverse`."""
     base, *modifiers = name.strip().lower().split(":")
@@ -226,15 +216,6 @@ def poses_from_numbers(
     return poses @ _OPENGL_FROM_OPENCV
 
 
-def checked_poses(
-    numbers: Array, convention: PoseConvention, camera_from: bool = False
-) -> SE3:
-    """`poses_from_numbers` of (n, k) numbers of plausible size; ValueError for others."""
-    poses = poses_from_numbers(numbers, convention, camera_from)
-    check_units(numbers, convention)
-    return poses
-
-
 def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
     """Convert poses (...) to numbers (..., k), k the largest of `convention.counts`.
 
@@ -265,8 +246,8 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
 
 def matrix_convention(numbers: Array) -> PoseConvention:
     """`matrix` or `franka`, whichever makes rigid transforms of (n, 12 or 16) numbers."""
-    in_rows = _rigid(_matrices(numbers, "rows")).all()
-    in_columns = _rigid(_matrices(numbers, "columns")).all()
+    in_rows = _rigid(matrices_from_numbers(numbers, "rows")).all()
+    in_columns = _rigid(matrices_from_numbers(numbers, "columns")).all()
     width = numbers.shape[-1]
     problem = f"rows of {width} numbers are rigid transforms in"
     if in_rows and not in_columns:
@@ -282,65 +263,6 @@ def matrix_convention(numbers: Array) -> PoseConvention:
     raise ConventionError(
         f"{problem} {orders}", "matrix (row after row) or franka (column after column)"
     )
-
-
-def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
-    """Refuse numbers (n, k) that look like another unit than the convention only implies."""
-    numbers = np.asarray(numbers, dtype=np.float64)
-    if not convention.has("m", "mm"):
-        positions = numbers[..., :3]
-        if convention.is_matrix:
-            positions = _matrices(numbers, convention.layout)[..., :3, 3]
-        _check_lengths(np.linalg.norm(positions, axis=-1), convention)
-    if not convention.has_angles:
-        return
-    angles = np.abs(numbers[..., 3:])
-    if convention.layout == "vector":
-        angles = np.linalg.norm(angles, axis=-1)
-    largest = float(angles.max(initial=0.0))
-    if convention.degrees and largest > _MAX_DEG:
-        raise ValueError(
-            f"angles up to {largest:.4g} deg; do columns hold {convention.meaning}?"
-        )
-    if not largest > 0 or convention.has("rad", "deg"):
-        return
-    likely = "deg" if largest > 2 * np.pi + 1e-6 else "rad"
-    if convention.degrees != (likely == "deg"):
-        problem = f"angles up to {largest:.4g} look like"
-        raise _other_unit(likely, problem, convention)
-
-
-def _check_lengths(lengths: Array, convention: PoseConvention) -> None:
-    """Refuse distances (n,) from the base that arms do not have."""
-    metres = lengths * convention.metres_per_unit
-    far = metres > _MAX_REACH_M
-    near = (metres > 0) & (metres < _MIN_REACH_M)
-    near &= convention.metres_per_unit < 1.0
-    odd = far if far.any() else near
-    usual = metres[~odd]
-    median = float(np.median(usual)) if len(usual) else 0.0
-    if odd.any() and 0.03 < median < 3.0:
-        numbers = np.flatnonzero(odd) + 1
-        poses = ", ".join(numbers[:5].astype(str))
-        raise ValueError(
-            f"positions are {median:.3g} m from the base, but those of poses {poses} are"
-            f" {metres[odd][0]:.3g} m; millimetres and metres may be mixed: write all in one unit"
-        )
-    problem = f"positions up to {metres.max(initial=0.0):.4g} m from the base look like"
-    if far.any():
-        raise _other_unit("mm", problem, convention)
-    if near.any() and near.all():
-        raise _other_unit("m", problem, convention)
-
-
-def _other_unit(unit: str, problem: str, convention: PoseConvention) -> ConventionError:
-    """An error that offers the convention in a likely unit, and in the other one."""
-    other = _OTHER_UNIT[unit]
-    words = convention.name.split(":")
-    words = [word for word in words if word not in (unit, other)]
-    base = ":".join(words)
-    remedy = f"{base}:{unit} (or {base}:{other} if the unit is right as it is)"
-    return ConventionError(f"{problem} {_UNIT_NAMES[unit]}", remedy)
 
 
 def _rotations(numbers: Array, convention: PoseConvention) -> Rotation:
@@ -359,7 +281,7 @@ def _rotations(numbers: Array, convention: PoseConvention) -> Rotation:
     return Rotation.from_quat(numbers, scalar_first=convention.layout == "wxyz")
 
 
-def _matrices(numbers: Array, layout: str) -> Array:
+def matrices_from_numbers(numbers: Array, layout: str) -> Array:
     """(..., 3 or 4, 4) matrices of numbers (..., 12 or 16)."""
     *shape, count = numbers.shape
     height = count // 4
@@ -389,9 +311,9 @@ def _from_matrices(numbers: Array, convention: PoseConvention) -> SE3:
         stated = "franka"
         other = "matrix"
         order = "row after row"
-    matrices = _matrices(numbers, convention.layout)
+    matrices = matrices_from_numbers(numbers, convention.layout)
     broken = ~_rigid(matrices)
-    transposed = _matrices(numbers, CONVENTIONS[other].layout)
+    transposed = matrices_from_numbers(numbers, CONVENTIONS[other].layout)
     if broken.any() and _rigid(transposed).all():
         _, *modifiers = convention.name.split(":")
         remedy = ":".join([other, *modifiers])

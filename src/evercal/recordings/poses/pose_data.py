@@ -7,10 +7,8 @@ does not matter.
 
 import re
 from collections.abc import Mapping, Sequence
-from itertools import chain, product
+from itertools import chain
 from typing import Any
-
-import numpy as np
 
 from evercal.bounds import require_at_most
 from evercal.recordings.images import IMAGE_ENDINGS
@@ -19,26 +17,27 @@ from evercal.recordings.poses.conventions import (
     Given,
     pose_convention,
 )
+from evercal.recordings.poses.pose_arrays import (
+    MATRICES,
+    Columns,
+    are_poses,
+    composed_poses,
+    nested_shape,
+    poses_first,
+    rotations_with_translations,
+)
 from evercal.recordings.poses.pose_columns import (
-    HEADERS,
     PoseTable,
     has_position,
     named_numbers,
     plain_numbers,
 )
 from evercal.recordings.poses.row_files import (
-    name_and_unit,
     number_array,
     row_labels,
     text_cells,
 )
 from evercal.storage.text_files import natural_key
-from evercal.typing import Array
-
-Columns = Mapping[str, Any]
-"""Values by key: of one pose, or lists of the values of all poses."""
-Shape = tuple[int, ...]
-"""Lengths of nested lists."""
 
 _KEYS = (
     "poses",
@@ -66,9 +65,6 @@ _ROLES = {
 }
 """Keys of the robot or of the camera, with the rest of the key after or before."""
 _INVERSE = re.compile("base2gripper|gripper_from_base|cam2target|board_from_camera")
-_WIDTHS = (6, 7, 8, 12, 13, 16, 17)
-"""Numbers of a pose, possibly after a stamp."""
-_MATRICES = ((4, 4), (3, 4))
 _LISTS = {
     "translation_m": ("x_m", "y_m", "z_m"),
     "xyz": ("x", "y", "z"),
@@ -87,12 +83,6 @@ _STAMPS = (
     ("nanoseconds", "seconds"),
 )
 """Keys of a stamp in nanoseconds and seconds: of ROS 2, of ROS 1, and of others."""
-_ROTATION = re.compile(
-    r"(?:rotation_matri(?:x|ces)|rotations?|rot|rmats?|rvecs?|rotvecs?|r)(_.*)?"
-)
-_TRANSLATION = re.compile(
-    r"(?:translation_vectors?|translations?|tvecs?|positions?|pos|t)(_.*)?"
-)
 
 
 def pose_data(data: Any, given: Given, robot: bool = True) -> PoseTable:
@@ -113,11 +103,11 @@ def pose_data(data: Any, given: Given, robot: bool = True) -> PoseTable:
     if True in kinds:
         return _of_objects(data, given, robot)
     array = number_array(data, "a list of poses")
-    numbers = _poses_first(array, _MATRICES)
+    numbers = poses_first(array, MATRICES)
     if numbers.shape[-2:] == (6, 1):  # ViSP's vectors of poses
         numbers = numbers.reshape(-1, 6)
         given = given or pose_convention("ur")
-    if numbers.ndim == 1 or numbers.shape in _MATRICES:
+    if numbers.ndim == 1 or numbers.shape in MATRICES:
         numbers = numbers[None]
     return plain_numbers(numbers, given)
 
@@ -174,7 +164,7 @@ def _of_object(data: Columns, given: Given, robot: bool) -> PoseTable:
     inner = []
     has_arrays = False
     for key, value in columns.items():
-        is_array = len(_shape(value)) > 1
+        is_array = len(nested_shape(value)) > 1
         has_arrays |= is_array
         if key in _KEYS and not is_array:
             inner.append(key)
@@ -269,13 +259,13 @@ def _of_arrays(columns: Columns, given: Given, plural: bool) -> PoseTable | None
     shapes = {}
     keys = []
     for key, value in columns.items():
-        shapes[key] = _shape(value)
+        shapes[key] = nested_shape(value)
         if key in _KEYS and len(shapes[key]) > 1:
             keys.append(key)
     pairs = []
     if not keys:
-        keys = [key for key in columns if _are_poses(key, shapes[key], plural)]
-        pairs = _rotations_with_translations(shapes, plural)
+        keys = [key for key in columns if are_poses(key, shapes[key], plural)]
+        pairs = rotations_with_translations(shapes, plural)
     if len(keys) + len(pairs) > 1:
         raise _unclear([*keys, *map(" with ".join, pairs)], columns)
     labels = dict(columns)
@@ -283,7 +273,7 @@ def _of_arrays(columns: Columns, given: Given, plural: bool) -> PoseTable | None
         del labels[key]
     if pairs:
         rotation, translation = pairs[0]
-        table = _composed(columns, rotation, translation, given)
+        table = composed_poses(columns, rotation, translation, given)
     elif keys:
         table = pose_data(columns[keys[0]], given)
     else:
@@ -291,91 +281,12 @@ def _of_arrays(columns: Columns, given: Given, plural: bool) -> PoseTable | None
     return _labelled(table, labels, plural)
 
 
-def _are_poses(key: str, shape: Shape, plural: bool) -> bool:
-    """Whether an array of a shape holds matrices, or rows of numbers other than joint values."""
-    are_matrices = shape[-2:] in _MATRICES or shape[:2] in _MATRICES
-    if are_matrices:
-        return True
-    is_table = len(shape) == 2 and shape[1] in _WIDTHS
-    return plural and is_table and "joint" not in key.lower()
-
-
-def _rotations_with_translations(
-    shapes: Mapping[str, Shape], plural: bool
-) -> list[tuple[str, str]]:
-    """Keys of rotations and of translations that end alike."""
-    rotations = {}
-    translations = {}
-    for key, shape in shapes.items():
-        name = name_and_unit(key)[0]
-        match = _ROTATION.fullmatch(name)
-        if match and len(shape) > 1:
-            rotations[key] = match[1]
-        match = _TRANSLATION.fullmatch(name)
-        if match and (len(shape) > 1 or (plural and shape)):
-            translations[key] = match[1]
-    pairs = []
-    for rotation, translation in product(rotations, translations):
-        if rotations[rotation] == translations[translation]:
-            pairs.append((rotation, translation))
-    return pairs
-
-
-def _composed(
-    columns: Columns, rotation: str, translation: str, given: Given
-) -> PoseTable:
-    """Poses of rotations (matrices, quaternions, vectors or angles) and translations."""
-    unit = name_and_unit(translation)[1] or "m"
-    words = [f"x_{unit}", f"y_{unit}", f"z_{unit}"]
-    array = number_array(columns[translation], repr(translation))
-    translations = _rows(array, 3)
-    array = number_array(columns[rotation], repr(rotation))
-    rotations = _poses_first(array, ((3, 3),))
-    width = rotations.size // max(len(translations), 1)
-    if width == 9:
-        words += [f"r{end}" for end in HEADERS["rotation matrix"].ends]
-    elif width == 4:
-        words += ["q1", "q2", "q3", "q4"]
-    elif "vec" in rotation:
-        words += ["rotvec_x", "rotvec_y", "rotvec_z"]
-    else:
-        words += ["rx", "ry", "rz"]
-    rotations = _rows(rotations, width)
-    numbers = np.concatenate([translations, rotations], -1)
-    cells = text_cells(map(repr, row) for row in numbers.tolist())
-    return named_numbers(words, cells, given)
-
-
-def _rows(array: Array, width: int) -> Array:
-    """(n, width) numbers of arrays with an axis too many, or with the poses last as in MATLAB."""
-    array = np.squeeze(array)
-    if array.ndim == 2:
-        height, columns = array.shape
-        if height == width != columns:
-            array = array.T
-    return array.reshape(-1, width)
-
-
-def _poses_first(array: Array, shapes: tuple[tuple[int, int], ...]) -> Array:
-    """(n, rows, columns) matrices of an array that has the poses last, as in MATLAB."""
-    if array.ndim != 3 or array.shape[:2] not in shapes:
-        return array
-    if array.shape[1:] in shapes:
-        # Four matrices may lie along either axis: rotations are orthogonal along the right one.
-        block = array[..., :3, :3]
-        gram = np.swapaxes(block, 1, 2) @ block
-        error = np.abs(gram - np.eye(3)).max()
-        if error < 0.01:
-            return array
-    return np.moveaxis(array, -1, 0)
-
-
 def _labelled(table: PoseTable, columns: Columns, plural: bool) -> PoseTable:
     """A table with the image names and stamps of the columns that hold one value a pose."""
     keys = []
     lists = []
     for key, value in columns.items():
-        if len(_shape(value)) == 1:
+        if len(nested_shape(value)) == 1:
             keys.append(key)
             lists.append(value)
     count = len(table.numbers)
@@ -434,12 +345,3 @@ def _cells(row: Columns) -> dict[str, object]:
         names = names or [f"{key}_{i}" for i in range(len(values))]
         cells |= dict(zip(names, values, strict=False))
     return cells
-
-
-def _shape(value: object) -> Shape:
-    """Lengths of nested lists, by the first of each: all are compared when numbers are read."""
-    if not isinstance(value, list):
-        return ()
-    if not value:
-        return (0,)
-    return (len(value), *_shape(value[0]))

@@ -20,12 +20,12 @@ from evercal.recordings.poses.conventions import (
     Given,
     PoseConvention,
     asking_for,
-    checked_poses,
     pose_convention,
 )
 from evercal.recordings.poses.pose_columns import PoseTable
 from evercal.recordings.poses.pose_data import pose_data
 from evercal.recordings.poses.pose_table import read_pose_table
+from evercal.recordings.poses.pose_units import checked_poses
 from evercal.recordings.poses.row_files import Names
 from evercal.robot.arm import Arm
 from evercal.storage.text_files import (
