@@ -1,30 +1,30 @@
 """evercal estimates the pose of a camera in the robot's base frame from one ordinary image.
 
-    Map               learned scenes: learn, localize, track, calibrate, check, evaluate
-    PoseEstimate      the answer for one image: pose, covariance, status, reason
-    Calibration       pose of a camera with its sources of error, checks and verdict
-    Shift             motion of a camera since its calibration
-    LearnReport       what learning a scene did
-    Scores            accuracy on recordings with known poses
+    Map               learned scenes: learn, localize, track, calibrate, check, evaluate.
+    PoseEstimate      the answer for one image: pose, covariance, status, reason.
+    Calibration       pose of a camera with its sources of error, checks and verdict.
+    Shift             motion of a camera since its calibration.
+    LearnReport       what learning a scene did.
+    Scores            accuracy on recordings with known poses.
 
-    SE3               one rigid transform, or an array of them
-    UncertainPose     a rigid transform with a covariance
-    Camera            intrinsics of one camera at one image size
-    Frame             one image with its camera and poses
-    Recording         frames of one place in recorded order
-    PosePairs         poses of the gripper and of a board in the camera
+    SE3               one rigid transform, or an array of them.
+    UncertainPose     a rigid transform with a covariance.
+    Camera            intrinsics of one camera at one image size.
+    Frame             one image with its camera and poses.
+    Recording         frames of one place in recorded order.
+    PosePairs         poses of the gripper and of a board in the camera.
 
-    load_recording    read a folder or a bag
-    read_image        read an image file as RGB
-    read_calibration  read a calibration file
-    solve             calibrate a camera from pose pairs
-    next_views        the gripper poses that would determine a camera best
+    load_recording    read a folder or a bag.
+    read_image        read an image file as RGB.
+    read_calibration  read a calibration file.
+    solve             calibrate a camera from pose pairs.
+    next_views        the gripper poses that would determine a camera best.
 
-    LocalizeOptions   effort and thresholds of localization
-    MapOptions        sizes and priors of a map
-    ReadOptions       how to read a recording
-    Client            a map that `evercal serve` serves
-    InputError        misuse or bad input; its message says what to do
+    LocalizeOptions   effort and thresholds of localization.
+    MapOptions        sizes and priors of a map.
+    ReadOptions       how to read a recording.
+    Client            a map that `evercal serve` serves.
+    InputError        misuse or bad input; its message says what to do.
 
 They are loaded on first use, so that `import evercal` is fast.
 """

@@ -83,22 +83,21 @@ def select_images(
     """
     if given:
         uses = {Path(use.name).resolve(): use for use in calibration.images}
-        return _spread(
-            [ImageFile(path, uses.get(path.resolve())) for path in given]
-        ), ""
+        files = [ImageFile(path, uses.get(path.resolve())) for path in given]
+        return _spread(files), ""
     if not calibration.images:
-        return (
-            [],
-            "No pictures: the calibration names no images; pass some with `images`.",
-        )
+        words = "No pictures: the calibration names no images; pass some with `images`."
+        return [], words
     used: list[ImageFile] = []
     rejected: list[ImageFile] = []
     for use in calibration.images:
-        path = next(
-            (p for p in (Path(use.name), folder / use.name) if p.is_file()), None
-        )
-        if path is not None:
-            (used if use.used else rejected).append(ImageFile(path, use))
+        path = _existing([Path(use.name), folder / use.name])
+        if path is None:
+            continue
+        if use.used:
+            used.append(ImageFile(path, use))
+        else:
+            rejected.append(ImageFile(path, use))
     if not used and not rejected:
         return [], (
             f"No pictures: none of the {len(calibration.images)} images of the calibration exists"
@@ -107,6 +106,13 @@ def select_images(
     if not used:
         return _spread(rejected), ""
     return [*_spread(used, MAX_IMAGES - len(rejected[:1])), *rejected[:1]], ""
+
+
+def _existing(paths: Sequence[Path]) -> Path | None:
+    for path in paths:
+        if path.is_file():
+            return path
+    return None
 
 
 def _spread(files: list[ImageFile], count: int = MAX_IMAGES) -> list[ImageFile]:
@@ -140,14 +146,16 @@ def annotate_images(
         except InputError as error:
             missing.append(f"One picture is missing: {error}.")
             continue
-        board = boards.get(file.use.name) if boards and file.use is not None else None
-        drawn = _with_evidence(calibration, camera, image, board or localizer)
+        evidence: LearnedLocalizer | BoardSeen | None = localizer
+        if boards and file.use is not None:
+            evidence = boards.get(file.use.name) or localizer
+        drawn = _with_evidence(calibration, camera, image, evidence)
         picture = drawn.image
         if older is not None:
-            picture = draw_axes(
-                picture, camera, older.parent_from_child.inverse(), pale=True
-            )
-        picture = draw_axes(picture, camera, calibration.parent_from_child.inverse())
+            pose = older.parent_from_child.inverse()
+            picture = draw_axes(picture, camera, pose, pale=True)
+        pose = calibration.parent_from_child.inverse()
+        picture = draw_axes(picture, camera, pose)
         summary = "; ".join(filter(None, [_use(file.use), drawn.summary]))
         annotated[str(file.path)] = LandmarkPicture(picture, drawn.landmarks, summary)
         on_image()
@@ -158,8 +166,10 @@ def annotate_images(
     scene = _scene_of(calibration, localizer)
     digest = calibration.source.get("map")
     other = digest is not None and (scene is None or scene.digest != digest)
-    still = scene is not None and scene.metric and scene.parent_frame == "base"
-    around = Surroundings.of(scene if still and not calibration.on_gripper else None)
+    around = Surroundings()
+    still = not calibration.on_gripper
+    if still and scene is not None and scene.metric and scene.parent_frame == "base":
+        around = Surroundings.of(scene)
     return AnnotatedImages(annotated, tuple(missing), other, around)
 
 
@@ -190,19 +200,36 @@ def _with_evidence(
     if scene is not None and estimate.scene not in (None, scene):
         return LandmarkPicture(large, 0, f"shows {estimate.scene}, not {scene}")
     # A camera or a thing on the gripper moves, so images are compared with their own poses.
-    still = not calibration.on_gripper and estimate.parent_frame == "base"
-    pose = calibration.parent_from_child if still else None
-    return draw_landmarks(image, estimate, evidence, camera, pose)
+    pose = None
+    if not calibration.on_gripper and estimate.parent_frame == "base":
+        pose = calibration.parent_from_child
+    return draw_landmarks(
+        image,
+        estimate,
+        evidence,
+        camera,
+        pose,
+    )
 
 
 def _with_corners(camera: Camera, large: Image, board: BoardSeen) -> LandmarkPicture:
     enlarged = large.shape[1] / camera.width
-    errors = board.projected(camera) - board.view.pixels
-    pixels = resize_pixels(board.view.pixels, enlarged)
+    detected = board.view.pixels
+    errors = board.projected(camera) - detected
+    pixels = resize_pixels(detected, enlarged)
     lengths = np.linalg.norm(errors, axis=1)
-    largest = max(1.0, float(np.nanpercentile(lengths, 90)))
-    drawn, times = draw_residuals(large, pixels, enlarged * errors, lengths, largest)
-    rms = float(np.sqrt(np.nanmean(lengths**2)))
+    typical = float(np.nanpercentile(lengths, 90))
+    largest = max(1.0, typical)
+    vectors = enlarged * errors
+    drawn, times = draw_residuals(
+        large,
+        pixels,
+        vectors,
+        lengths,
+        largest,
+    )
+    mean_square = np.nanmean(lengths**2)
+    rms = float(np.sqrt(mean_square))
     summary = f"{len(pixels)} corners, {rms:.2f} px rms, lines {times} times as long"
     return LandmarkPicture(drawn, 0, summary)
 
@@ -210,16 +237,24 @@ def _with_corners(camera: Camera, large: Image, board: BoardSeen) -> LandmarkPic
 def _use(use: ImageUse | None) -> str:
     if use is None:
         return "not an image of the calibration"
-    return "used" if use.used else f"rejected: {use.reason}"
+    if use.used:
+        return "used"
+    return f"rejected: {use.reason}"
 
 
 def _scene_of(
     calibration: Calibration, localizer: "LearnedLocalizer"
 ) -> SceneMap | None:
-    name, digest = (calibration.source.get(key) for key in ("scene", "map"))
+    name = calibration.source.get("scene")
+    digest = calibration.source.get("map")
     maps = [scene for scene in localizer.contents.scenes if isinstance(scene, SceneMap)]
-    own = [scene for scene in maps if scene.digest == digest]  # also after a rename
-    return next((scene for scene in (*own, *maps) if own or scene.name == name), None)
+    for scene in maps:
+        if scene.digest == digest:  # also after a rename
+            return scene
+    for scene in maps:
+        if scene.name == name:
+            return scene
+    return None
 
 
 def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:

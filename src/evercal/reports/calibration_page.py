@@ -1,22 +1,31 @@
 """The HTML report of `evercal report`: a calibration, its quality and its evidence."""
 
-import json
 import math
 import os
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from evercal.calibration.calibration import Calibration, position_shares
+from evercal.calibration.calibration import Calibration
 from evercal.calibration.located import deviations, length_mm_deg
-from evercal.calibration.verdict import TIERS, expected_error, tier, verdict
+from evercal.calibration.verdict import expected_error, verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.geometry.camera import COEFFICIENTS
 from evercal.reports.calibration_images import AnnotatedImages
+from evercal.reports.calibration_tables import (
+    camera_table,
+    check_table,
+    deviation_table,
+    error_budget,
+    has_uncertainty,
+    level,
+    source_table,
+    suitability_table,
+    use_table,
+)
 from evercal.reports.charts import Chart, Panel, Shape
 from evercal.reports.overlay import origin_in_view
-from evercal.reports.page import Picture, Table, Tile, render
+from evercal.reports.page import Picture, Tile, render
 from evercal.reports.scene import (
     ABOVE,
     CHI2_95,
@@ -29,10 +38,10 @@ from evercal.reports.scene import (
     view_panel,
 )
 
-_SHOWN_ELSEWHERE = ("warnings", "left_open", "camera_sigma", "joints_move_mm")
-_LONGEST_CELL = 160
 _VIEW_PX = (420, 400)
+"""Width and height of a view from above or from the side."""
 _BARS_PX = (850, 120)
+"""Width and height of a chart of residuals."""
 
 
 class NamedCalibration(NamedTuple):
@@ -89,38 +98,40 @@ def calibration_page(
     calibration = file.calibration
     missing = (*images.missing, *_missing(calibration))
     headline, _, details = (calibration.verdict or verdict(calibration)).partition(". ")
-    old = None if older is None else older.calibration
-    uncertain = _has_uncertainty(calibration)
-    own_map = calibration.source.get("map")
+    deviations_of = None
+    views = None
+    if has_uncertainty(calibration):
+        deviations_of = deviation_table(calibration, point_m)
+        views = camera_views(calibration, images.surroundings)
+    change = None
+    same_map = False
+    if older is not None:
+        change = difference(calibration, older.calibration)
+        digest = calibration.source.get("map")
+        same_map = digest is not None
+        same_map &= older.calibration.source.get("map") == digest
     html = render(
         "calibration.html",
         title=f"{file.name}: {calibration.parent_frame}_from_{calibration.child_frame}",
         calibration=calibration,
         parent=calibration.parent_frame,
         child=calibration.child_frame,
-        level=_level(calibration),
+        level=level(calibration),
         headline=headline,
         details=details,
         first=_tiles(calibration),
         suitability=suitability_table(calibration),
-        deviations=deviation_table(calibration, point_m) if uncertain else None,
+        deviations=deviations_of,
         older=older,
-        difference=None if old is None else difference(calibration, old),
-        same_map=old is not None
-        and own_map is not None
-        and old.source.get("map") == own_map,
+        difference=change,
+        same_map=same_map,
         images=images,
         origin=_origin(calibration),
-        pictures=[
-            Picture(drawn.image, f"{os.path.basename(name)}: {drawn.summary}")
-            for name, drawn in images.images.items()
-        ],
+        pictures=_pictures(images),
         landmarks_drawn=any(drawn.landmarks for drawn in images.images.values()),
         boards_drawn=boards,
         store=store,
-        camera_views=camera_views(calibration, images.surroundings)
-        if uncertain
-        else None,
+        camera_views=views,
         budget=error_budget(calibration),
         camera=camera_table(calibration),
         residuals=residual_chart(calibration),
@@ -132,17 +143,18 @@ def calibration_page(
     return CalibrationPage(html, missing)
 
 
-def _level(calibration: Calibration) -> Literal["good", "fair", "bad", ""]:
-    if not _has_uncertainty(calibration) and not calibration.checks.to_dict():
-        return ""
-    best = tier(calibration)
-    return "bad" if best is None else "fair" if best is TIERS[-1] else "good"
+def _pictures(images: AnnotatedImages) -> list[Picture]:
+    pictures = []
+    for name, drawn in images.images.items():
+        caption = f"{os.path.basename(name)}: {drawn.summary}"
+        pictures.append(Picture(drawn.image, caption))
+    return pictures
 
 
 def _tiles(calibration: Calibration) -> list[Tile]:
     """The expected error first, then what supports it."""
     tiles = []
-    if _level(calibration):
+    if level(calibration):
         mm, deg = expected_error(calibration)
         rule = "the larger of √3 standard deviations per axis and half the repeatability error"
         tiles = [
@@ -151,7 +163,9 @@ def _tiles(calibration: Calibration) -> list[Tile]:
         ]
     if images := calibration.images:
         rejected = sum(not image.used for image in images)
-        words = f"images used; {rejected} rejected" if rejected else "images used"
+        words = "images used"
+        if rejected:
+            words += f"; {rejected} rejected"
         tiles.append(Tile(f"{len(images) - rejected} of {len(images)}", words))
     halves = calibration.checks.repeatability_mm
     if halves is not None:
@@ -160,182 +174,32 @@ def _tiles(calibration: Calibration) -> list[Tile]:
     return tiles
 
 
-def suitability_table(calibration: Calibration) -> Table:
-    """The uses that a calibration serves."""
-    known = _level(calibration)
-    best = tier(calibration)
-    serves = ["yes" if known and best and t.mm >= best.mm else "no" for t in TIERS]
-    rows = [
-        (t.name, f"{t.mm:g}", f"{t.deg:g}", word)
-        for t, word in zip(TIERS, serves, strict=True)
-    ]
-    header = (
-        "use",
-        "position error below (mm)",
-        "rotation error below (deg)",
-        "suitable",
-    )
-    return Table(
-        header, rows, "A use is suitable if both expected errors lie below its bounds."
-    )
-
-
 def _origin(calibration: Calibration) -> str:
     if calibration.camera is None:
         return ""
     pose = calibration.parent_from_child.inverse()
     pixel, outside = origin_in_view(calibration.camera, pose)
-    return (
-        f"lies {outside}"
-        if outside
-        else f"projects to pixel ({pixel[0]:.1f}, {pixel[1]:.1f})"
-    )
+    if outside:
+        return f"lies {outside}"
+    return f"projects to pixel ({pixel[0]:.1f}, {pixel[1]:.1f})"
 
 
 def _missing(calibration: Calibration) -> list[str]:
     checks = calibration.checks
-    gaps = {
-        "No uncertainty: the calibration states none.": _has_uncertainty(calibration),
-        "No list of images: the calibration holds none.": calibration.images,
-        "No error budget: the calibration holds none.": calibration.error_terms,
-        "No repeatability: two halves of the data were not compared.": checks.repeatability_mm
-        is not None,
-        "No held-out error: no data were held out.": checks.held_out_mm is not None,
-        "No intrinsics: the calibration holds none.": calibration.camera,
-    }
-    return [sentence for sentence, present in gaps.items() if not present]
-
-
-def _has_uncertainty(calibration: Calibration) -> bool:
-    return bool(np.trace(calibration.covariance) > 0)
-
-
-def deviation_table(
-    calibration: Calibration, point_m: tuple[float, float, float] | None = None
-) -> Table:
-    """Standard deviations along axes: of the position, the rotation, and a point if given."""
-    parent = calibration.parent_frame
-    child = calibration.child_frame
-    uncertain = calibration.uncertain_pose
-    sigma = np.sqrt(np.diag(calibration.covariance).clip(0))
-    position = [*(1000 * sigma[:3]), calibration.sigma_mm]
-    rotation = [*np.rad2deg(sigma[3:]), calibration.sigma_deg]
-    rows = [
-        (f"position along the axes of {parent} (mm)", *(f"{v:.3f}" for v in position)),
-        (f"rotation about the axes of {child} (deg)", *(f"{v:.4f}" for v in rotation)),
-    ]
-    if point_m is not None:
-        axes = 1000 * np.sqrt(np.diag(uncertain.point_covariance(point_m)).clip(0))
-        point = ", ".join(f"{value:g}" for value in point_m)
-        name = f"point ({point}) m of {child} along the axes of {parent} (mm)"
-        rows.append(
-            (name, *(f"{v:.3f}" for v in (*axes, uncertain.point_sigma_mm(point_m))))
-        )
-    return Table(("", "x", "y", "z", "root mean square"), rows, "Standard deviations")
-
-
-def error_budget(calibration: Calibration) -> Table:
-    """The causes of the uncertainty and their sum."""
-    terms = calibration.error_terms
-    rows = [
-        (
-            term.name,
-            f"{term.translation_mm:.2f}",
-            f"{term.rotation_deg:.3f}",
-            f"{100 * share:.0f}",
-        )
-        for term, share in zip(terms, position_shares(terms), strict=True)
-    ]
-    if rows:
-        total = f"{calibration.sigma_mm:.2f}", f"{calibration.sigma_deg:.3f}"
-        rows.append(("all", *total, "100"))
-    header = (
-        "cause",
-        "position (mm)",
-        "rotation (deg)",
-        "share of the position's variance (%)",
-    )
-    return Table(header, rows, "Error budget: standard deviation per axis by cause")
-
-
-def use_table(calibration: Calibration) -> Table:
-    """All images with their use; those of boards with what they contribute."""
-    images = calibration.images
-    checks = calibration.checks
-    folders = {image.name[: image.name.rfind("/") + 1] for image in images}
-    folder = folders.pop() if len(folders) == 1 else ""
-    share = checks.information_percent or {}
-    moved = checks.leave_one_out_mm or {}
-    rows = [
-        (
-            image.name.removeprefix(folder),
-            "yes" if image.used else "no",
-            image.reason,
-            _fixed(image.residual_mm, 2),
-            _fixed(image.residual_deg, 3),
-            _fixed(share.get(image.name), 1),
-            _fixed(moved.get(image.name), 3),
-        )
-        for image in images
-    ]
-    measures = (
-        "residual (mm)",
-        "residual (deg)",
-        "information (%)",
-        "moves position by (mm)",
-    )
-    used = sum(image.used for image in images)
-    caption = f"{used} of {len(images)} images used" + (
-        f", all in {folder}" if folder else ""
-    )
-    return Table(("name", "used", "reason", *measures), rows, caption)
-
-
-def camera_table(calibration: Calibration) -> Table:
-    """The intrinsics, with standard deviations where they were estimated."""
-    camera = calibration.camera
-    rows = []
-    if camera is not None:
-        sigma = calibration.checks.camera_sigma or {}
-        values = {
-            f"{name} (px)": getattr(camera, name) for name in ("fx", "fy", "cx", "cy")
-        }
-        values |= dict(zip(COEFFICIENTS[camera.model], camera.distortion, strict=False))
-        rows = [
-            (name, f"{value:.4f}", _fixed(sigma.get(name.partition(" ")[0]), 4))
-            for name, value in values.items()
-        ]
-        rows.insert(0, ("image size (px)", f"{camera.width}x{camera.height}", "-"))
-    return Table(("intrinsics", "value", "standard deviation"), rows)
-
-
-def check_table(calibration: Calibration) -> Table:
-    """The checks that were made and other values estimated with the transform."""
-    rows = [
-        (key.replace("_", " "), _cell(value))
-        for key, value in calibration.checks.to_dict().items()
-        if key not in _SHOWN_ELSEWHERE and len(_cell(value)) <= _LONGEST_CELL
-    ]
-    return Table(("check", "value"), rows)
-
-
-def source_table(name: str, calibration: Calibration) -> Table:
-    """What the calibration was made from."""
-    source = {"file": name, **calibration.source, "created": calibration.created}
-    rows = [
-        (key.replace("_", " "), _cell(value)) for key, value in source.items() if value
-    ]
-    return Table(("property", "value"), rows)
-
-
-def _cell(value: object) -> str:
-    if isinstance(value, str):
-        return value
-    return f"{value:.6g}" if isinstance(value, float) else json.dumps(value)
-
-
-def _fixed(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
+    missing = []
+    if not has_uncertainty(calibration):
+        missing.append("No uncertainty: the calibration states none.")
+    if not calibration.images:
+        missing.append("No list of images: the calibration holds none.")
+    if not calibration.error_terms:
+        missing.append("No error budget: the calibration holds none.")
+    if checks.repeatability_mm is None:
+        missing.append("No repeatability: two halves of the data were not compared.")
+    if checks.held_out_mm is None:
+        missing.append("No held-out error: no data were held out.")
+    if not calibration.camera:
+        missing.append("No intrinsics: the calibration holds none.")
+    return missing
 
 
 def camera_views(calibration: Calibration, around: Surroundings) -> Chart:
@@ -345,20 +209,33 @@ def camera_views(calibration: Calibration, around: Surroundings) -> Chart:
     ends = np.stack([np.zeros(3), pose.pose.translation_m])
     extent = float(np.ptp(around.bounds(ends), axis=0).max())
     times = readable_scale([Ellipsoid.of(pose)], 0.07 * extent)
-    variances, directions = np.linalg.eigh(pose.covariance[:3, :3])
-    half = times * np.sqrt(CHI2_95 * np.diag(pose.covariance)[:3].clip(0))
-    seen = np.concatenate([ends, [ends[1] - half, ends[1] + half]])
+    covariance = pose.covariance[:3, :3]
+    variances, directions = np.linalg.eigh(covariance)
+    half = times * np.sqrt(CHI2_95 * np.diag(covariance).clip(0))
+    ellipsoid = [ends[1] - half, ends[1] + half]
+    seen = np.concatenate([ends, ellipsoid])
     width, depth, _ = np.ptp(around.bounds(seen), axis=0)
-    camera = calibration.camera
+    view = None
+    if calibration.camera is not None:
+        view = Frustum.of(pose.pose, calibration.camera)
     panels = []
-    view = None if camera is None else Frustum.of(pose.pose, camera)
     for plane in (ABOVE, (int(depth > width), 2)):  # from the wider side
         shape = Shape("area", ellipse(pose, times, plane), "orange", opacity=0.3)
         axes = Axes(plane, parent)
-        panels.append(view_panel(_VIEW_PX, axes, around, seen, view, [shape]))
+        panels.append(
+            view_panel(
+                _VIEW_PX,
+                axes,
+                around,
+                seen,
+                view,
+                [shape],
+            )
+        )
     c, b, a = 1000 * np.sqrt(CHI2_95 * variances.clip(0))
     forward = pose.pose.rotation_matrix()[:, 2]
-    angle = np.rad2deg(np.arccos(np.clip(abs(directions[:, 2] @ forward), 0.0, 1.0)))
+    cosine = abs(directions[:, 2] @ forward)
+    angle = np.rad2deg(np.arccos(np.clip(cosine, 0.0, 1.0)))
     caption = (
         f"In {parent}, from above and from the side. The 95 % ellipsoid of the position has half"
         f" axes of {a:.2f}, {b:.2f} and {c:.2f} mm and is drawn {times} times as large. The longest"
@@ -370,9 +247,8 @@ def camera_views(calibration: Calibration, around: Surroundings) -> Chart:
 def residual_chart(calibration: Calibration) -> Chart | None:
     """Bars of the residuals of all images, cut at twice the largest used one; None without any."""
     images = calibration.images
-    rows = np.array(
-        [[i.residual_mm, i.residual_deg] for i in images], np.float64
-    ).reshape(-1, 2)
+    residuals = [[image.residual_mm, image.residual_deg] for image in images]
+    rows = np.array(residuals, np.float64).reshape(-1, 2)
     if not np.isfinite(rows).any():
         return None
     used = np.array([image.used for image in images])
@@ -385,7 +261,8 @@ def residual_chart(calibration: Calibration) -> Chart | None:
         np.nan_to_num(rows).T, ("mm", "deg"), ("", below), strict=True
     ):
         typical = float(values[used].max(initial=0.0))
-        top = max(min(1.1 * float(values.max()), 2 * typical or math.inf), 1e-3)
+        highest = 1.1 * float(values.max())
+        top = max(min(highest, 2 * typical or math.inf), 1e-3)
         ends = np.column_stack([numbers, values])
         bars = np.stack([ends, ends * (1, 0), ends * np.nan], axis=1)
         shapes = [

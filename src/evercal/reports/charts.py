@@ -92,8 +92,10 @@ class Panel:
             lines += [(tick.value, y0), (tick.value, y1), _GAP]
         for tick in self._ticks(1):
             lines += [(x0, tick.value), (x1, tick.value), _GAP]
-        grid = Shape("line", np.array(lines).reshape(-1, 2), "grid")
-        axes = Shape("line", np.array([(x0, y1), (x0, y0), (x1, y0)]), "text", 2.0)
+        points = np.array(lines).reshape(-1, 2)
+        grid = Shape("line", points, "grid")
+        corner = np.array([(x0, y1), (x0, y0), (x1, y0)])
+        axes = Shape("line", corner, "text", 2.0)
         return [grid, *self.shapes, axes]
 
     @property
@@ -101,22 +103,31 @@ class Panel:
         """The numbers at the axes, and what these show."""
         width, height = self.size
         x, y = self.labels
-        texts: list[Text] = [(y, -52, -12, 0), (x, width / 2, height + 40, 1)]
+        texts: list[Text] = []
+        texts.append((y, -52, -12, 0))
+        texts.append((x, width / 2, height + 40, 1))
         for tick in self._ticks(1):
-            texts.append((tick.words, -8, height - tick.pixels + 4, 2))
-        if x:
-            for tick in self._ticks(0):
-                texts.append((tick.words, tick.pixels, height + 18, 1))
+            base_line = height - tick.pixels + 4
+            texts.append((tick.words, -8, base_line, 2))
+        if not x:
+            return texts
+        for tick in self._ticks(0):
+            texts.append((tick.words, tick.pixels, height + 18, 1))
         return texts
 
     def _ticks(self, axis: int) -> list[Tick]:
         """Round numbers along an axis."""
         low, high = self.limits[:, axis].tolist()
+        extent = high - low
         size = self.size[axis]
-        step = _round_step((high - low) / min(max(size // 50, 5), 8))
-        digits = max(0, -int(np.floor(np.log10(step) + 1e-9)))
-        numbers = step * np.arange(np.ceil(low / step), np.floor(high / step) + 1)
-        pixels = ((numbers - low) / (high - low) * size).round(1)
+        most = min(max(size // 50, 5), 8)
+        step = _round_step(extent / most)
+        power = int(np.floor(np.log10(step) + 1e-9))
+        digits = max(0, -power)
+        first = np.ceil(low / step)
+        last = np.floor(high / step)
+        numbers = step * np.arange(first, last + 1)
+        pixels = ((numbers - low) / extent * size).round(1)
         ticks = []
         for number, pixel in zip(numbers.tolist(), pixels.tolist(), strict=True):
             # Adding zero makes a positive zero of a negative one.
@@ -151,9 +162,24 @@ def write(image: Image, text: Text, size: int = 13, ink: str = "text") -> None:
 
     words, x, y, align = text
     font = cv2.FontFace("sans")
-    width = cv2.getTextSize((0, 0), words, (0, 0), font, size, 400)[2]
+    width = cv2.getTextSize(
+        (0, 0),
+        words,
+        (0, 0),
+        font,
+        size,
+        400,
+    )[2]
     origin = (round(x - align * width / 2), round(y))
-    cv2.putText(image, words, origin, rgb(ink), font, size, 400)
+    cv2.putText(
+        image,
+        words,
+        origin,
+        rgb(ink),
+        font,
+        size,
+        400,
+    )
 
 
 def paint(image: Image, panel: Panel, left: int, top: int) -> None:
@@ -168,13 +194,23 @@ def paint(image: Image, panel: Panel, left: int, top: int) -> None:
     for shape in panel.drawn:
         pixels = _FINER * panel.pixels(shape.points)
         thickness = round(_FINER * shape.width)
-        if shape.kind == "dots":
-            colour = [255 + shape.opacity * (value - 255) for value in rgb(shape.ink)]
-            for centre in pixels.round().astype(int).tolist():
-                cv2.circle(large, centre, thickness // 2, colour, -1)
-        else:
-            large = overlay_lines(large, [pixels], [rgb(shape.ink)], thickness)
-    box = cv2.resize(large, (width, height), interpolation=cv2.INTER_AREA)
-    image[top : top + height, left : left + width] = box
+        colour = rgb(shape.ink)
+        if shape.kind != "dots":
+            large = overlay_lines(large, [pixels], [colour], thickness)
+            continue
+        pale = [255 + shape.opacity * (value - 255) for value in colour]
+        for centre in pixels.round().astype(int).tolist():
+            cv2.circle(
+                large,
+                centre,
+                thickness // 2,
+                pale,
+                -1,
+            )
+    box = cv2.resize(large, panel.size, interpolation=cv2.INTER_AREA)
+    bottom = top + height
+    right = left + width
+    image[top:bottom, left:right] = box
     for words, x, y, align in panel.texts:
-        write(image, (words, left + x, top + y, align))
+        placed = (words, left + x, top + y, align)
+        write(image, placed)

@@ -65,7 +65,8 @@ class DemoResult:
     def headlines(self) -> dict[str, str]:
         """Explanation of each main result, most important first."""
         position = _median(1000 * row.translation_error_m for row in self.test)
-        degrees = math.degrees(median(row.rotation_error_rad for row in self.test))
+        radians = median(row.rotation_error_rad for row in self.test)
+        degrees = math.degrees(radians)
         fixed = _median(camera.error_mm for camera in self.cameras)
         shift = _median(camera.shift_mm for camera in self.cameras)
         true_shift = _median(camera.true_shift_mm for camera in self.cameras)

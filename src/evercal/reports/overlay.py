@@ -77,14 +77,23 @@ def draw_landmarks(
     scene = next(s for s in localizer.contents.scenes if s.name == estimate.scene)
     whole = camera or estimate.camera or scene.adjusted_camera
     working = whole.short_side_resized(localizer.contents.short_side)
-    in_camera = scene.frame.camera_among_points(pose).inverse().apply(points)
+    map_from_camera = scene.frame.camera_among_points(pose)
+    in_camera = map_from_camera.inverse().apply(points)
     errors = working.project(in_camera) - pixels
     enlarged = large.shape[0] / working.height
     image_scale = image.shape[0] / working.height
-    residuals = image_scale * np.linalg.norm(errors, axis=1)
-    centres = resize_pixels(pixels, enlarged)
+    lengths = np.linalg.norm(errors, axis=1)
+    residuals = image_scale * lengths
     largest = image_scale * MAX_RESIDUAL_PX
-    drawn, times = draw_residuals(large, centres, enlarged * errors, residuals, largest)
+    centres = resize_pixels(pixels, enlarged)
+    vectors = enlarged * errors
+    drawn, times = draw_residuals(
+        large,
+        centres,
+        vectors,
+        residuals,
+        largest,
+    )
     median = np.nan
     if np.isfinite(residuals).any():
         median = float(np.nanmedian(residuals))
@@ -106,15 +115,27 @@ def draw_residuals(
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     drawn = np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
     limits = (0.0, largest)
-    radius = round(max(2.0, image.shape[1] / 180) * _FRACTIONS)
+    width = image.shape[1]
+    radius = round(max(2.0, width / 180) * _FRACTIONS)
     visible = (np.abs(pixels) < 1e5).all(axis=1)
-    centres = np.round(pixels[visible] * _FRACTIONS).astype(int).tolist()
+    fixed = np.round(pixels[visible] * _FRACTIONS)
+    centres = fixed.astype(int).tolist()
     colours = colour_map(residuals, limits)[visible].tolist()
     for centre, colour in zip(centres, colours, strict=True):
-        cv2.circle(drawn, centre, radius, colour, -1, cv2.LINE_AA, _FRACTION_BITS)
+        cv2.circle(
+            drawn,
+            centre,
+            radius,
+            colour,
+            -1,
+            cv2.LINE_AA,
+            _FRACTION_BITS,
+        )
     times = exaggeration(vectors)
-    lines = np.stack([pixels, pixels + times * vectors], 1)
-    drawn = overlay_lines(drawn, lines, [_VECTOR_COLOUR] * len(lines), 1)
+    ends = pixels + times * vectors
+    lines = np.stack([pixels, ends], 1)
+    inks = [_VECTOR_COLOUR] * len(lines)
+    drawn = overlay_lines(drawn, lines, inks, 1)
     _draw_legend(drawn, "residual (px)", limits)
     return drawn, times
 
@@ -128,12 +149,23 @@ def overlay_lines(
     drawn = np.ascontiguousarray(image).copy()
     for line, colour in zip(lines, colours, strict=True):
         # OpenCV uses 32-bit integers.
-        valid = np.asarray((np.abs(line) < 1e6).all(axis=1))
+        small = np.abs(line) < 1e6
+        valid = np.asarray(small.all(axis=1))
         finite = np.where(valid[:, None], line, 0)
-        fixed = np.round(finite * _FRACTIONS).astype(np.int32)
-        starts = np.flatnonzero(valid[:-1] & valid[1:])
+        rounded = np.round(finite * _FRACTIONS)
+        fixed = rounded.astype(np.int32)
+        both_valid = valid[:-1] & valid[1:]
+        starts = np.flatnonzero(both_valid)
         pieces = [fixed[start : start + 2] for start in starts]
-        cv2.polylines(drawn, pieces, False, colour, width, cv2.LINE_AA, _FRACTION_BITS)
+        cv2.polylines(
+            drawn,
+            pieces,
+            False,
+            colour,
+            width,
+            cv2.LINE_AA,
+            _FRACTION_BITS,
+        )
     return drawn
 
 
@@ -155,11 +187,13 @@ def colour_map(values: Array, limits: tuple[float, float]) -> Image:
 
     low, high = limits
     finite = np.isfinite(values)
-    share = (np.where(finite, values, low) - low) / max(high - low, 1e-12)
-    steps = np.round(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
+    above = np.where(finite, values, low) - low
+    share = above / max(high - low, 1e-12)
+    steps = np.round(255 * np.clip(share, 0.0, 1.0))
     colours = np.full((len(values), 3), _NAN_COLOUR, np.uint8)
     if len(values):
-        bgr = cv2.applyColorMap(steps[:, None], cv2.COLORMAP_VIRIDIS)
+        column = steps.astype(np.uint8)[:, None]
+        bgr = cv2.applyColorMap(column, cv2.COLORMAP_VIRIDIS)
         colours[finite] = bgr[finite, 0, ::-1]
     return colours
 
@@ -168,9 +202,10 @@ def resized(image: Image, width: int) -> Image:
     """An image with another width and the same aspect ratio."""
     import cv2
 
-    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    old_height, old_width = image.shape[:2]
+    height = max(1, round(old_height * width / old_width))
     method = cv2.INTER_CUBIC
-    if image.shape[1] > width:
+    if old_width > width:
         method = cv2.INTER_AREA
     other = cv2.resize(image, (width, height), interpolation=method)
     return np.asarray(other, np.uint8)
@@ -179,19 +214,33 @@ def resized(image: Image, width: int) -> Image:
 def _draw_legend(image: Image, text: str, limits: tuple[float, float]) -> None:
     import cv2
 
-    scale = max(0.4, min(0.8, image.shape[1] / 1000))
-    words = f"{limits[0]:.3g}  {text}  {limits[1]:.3g}"
+    low, high = limits
+    image_height, image_width = image.shape[:2]
+    scale = max(0.4, min(0.8, image_width / 1000))
+    words = f"{low:.3g}  {text}  {high:.3g}"
     (length, line), _ = cv2.getTextSize(words, _FONT, scale, 1)
     width = length + 2 * _MARGIN
     height = 2 * line + 3 * _MARGIN
-    if width > image.shape[1] or height > image.shape[0]:
+    if width > image_width or height > image_height:
         return
     panel = image[-height:, -width:]
     panel[:] = 255
-    ramp = colour_map(np.linspace(*limits, num=length), limits)
-    panel[_MARGIN : _MARGIN + line, _MARGIN:-_MARGIN] = ramp
-    origin = (image.shape[1] - width + _MARGIN, image.shape[0] - _MARGIN)
-    cv2.putText(image, words, origin, _FONT, scale, (0, 0, 0), 1, cv2.LINE_AA)
+    values = np.linspace(low, high, num=length)
+    rows = slice(_MARGIN, _MARGIN + line)
+    panel[rows, _MARGIN:-_MARGIN] = colour_map(values, limits)
+    left = image_width - width + _MARGIN
+    origin = (left, image_height - _MARGIN)
+    black = (0, 0, 0)
+    cv2.putText(
+        image,
+        words,
+        origin,
+        _FONT,
+        scale,
+        black,
+        1,
+        cv2.LINE_AA,
+    )
 
 
 def origin_in_view(camera: Camera, camera_from_frame: SE3) -> tuple[Array, str]:
@@ -199,8 +248,8 @@ def origin_in_view(camera: Camera, camera_from_frame: SE3) -> tuple[Array, str]:
     pixel = camera.project(camera_from_frame.translation_m)
     if camera_from_frame.translation_m[2] <= 0:
         return pixel, "behind the camera"
-    inside = (pixel > -0.5) & (pixel < (camera.width - 0.5, camera.height - 0.5))
-    if inside.all():
+    corner = (camera.width - 0.5, camera.height - 0.5)
+    if ((pixel > -0.5) & (pixel < corner)).all():
         return pixel, ""
     return pixel, "outside the image"
 
@@ -232,16 +281,30 @@ def draw_axes(
         return overlay_lines(image, lines, _PALE_AXES, thickness)
     if origin_in_view(camera, camera_from_frame)[1]:
         length = 0.09 * min(width, height)
-        directions = length * camera_from_frame.rotation_matrix()[:2].T
+        rotation = camera_from_frame.rotation_matrix()
+        directions = length * rotation[:2].T
         corner = np.array([2 * length, height - 2 * length])
-        lines = corner + np.stack([np.zeros((3, 2)), directions], 1)
-    drawn = overlay_lines(image, lines, [(255, 255, 255)] * 3, thickness + 2)
+        starts = np.zeros((3, 2))
+        lines = corner + np.stack([starts, directions], 1)
+    white = (255, 255, 255)
+    drawn = overlay_lines(image, lines, [white] * 3, thickness + 2)
     drawn = overlay_lines(drawn, lines, _AXES, thickness)
     for letter, line, colour in zip("xyz", lines, _AXES, strict=True):
-        end = line[0] + 1.15 * (line[-1] - line[0])
-        if (np.abs(end) < 1e5).all():
-            x, y = end.round().astype(int).tolist()
-            origin = (x - 5, y + 5)
-            for ink, width_px in (((255, 255, 255), 5), (colour, 2)):
-                cv2.putText(drawn, letter, origin, 0, 0.6, ink, width_px, cv2.LINE_AA)
+        along = line[-1] - line[0]
+        end = line[0] + 1.15 * along
+        if not (np.abs(end) < 1e5).all():
+            continue
+        x, y = end.round().astype(int).tolist()
+        origin = (x - 5, y + 5)
+        for ink, width_px in ((white, 5), (colour, 2)):
+            cv2.putText(
+                drawn,
+                letter,
+                origin,
+                0,
+                0.6,
+                ink,
+                width_px,
+                cv2.LINE_AA,
+            )
     return drawn

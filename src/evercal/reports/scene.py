@@ -31,6 +31,8 @@ ABOVE: Plane = (0, 1)
 """The axes of the base that a view from above shows."""
 CHI2_95 = 7.8147
 """Squared Mahalanobis distance of 95 % of three-dimensional errors."""
+_CORNERS = [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+"""Signs of the corners of an image, around it."""
 _DRAWN_POINTS = 6000
 """Landmarks in a chart, at most."""
 
@@ -55,7 +57,7 @@ class Frustum:
     def corners(self, depth_m: float) -> Array:
         """(4, 3) corners of the view at a depth, in the base frame, metres."""
         high = np.tan(self.fov_rad / 2)
-        signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        signs = np.array(_CORNERS)
         plane = signs * [high * self.aspect, high]
         rays = np.column_stack([plane, np.ones(4)])
         return self.base_from_camera.apply(depth_m * rays)
@@ -125,14 +127,18 @@ class Landmarks3D:
             in_map = keyframes.base_from_camera[i].apply(local)
             points.append(scene.frame.points_to_base(in_map))
             column, row = np.round(marks.pixels).astype(int).T
-            grey.append(keyframes.grey(i)[row, column])
+            image = keyframes.grey(i)
+            grey.append(image[row, column])
             # The error of a depth 1 / d is sigma / d^2; along the ray it is as much longer.
-            along = np.linalg.norm(local, axis=1) * marks.sigma / marks.inverse_depth
+            distance = np.linalg.norm(local, axis=1)
+            along = distance * marks.sigma / marks.inverse_depth
             sigma.append(1000 * scale * along)
         joined = np.concatenate(points)
-        valid = np.flatnonzero(np.isfinite(joined).all(1))
+        finite = np.isfinite(joined).all(1)
+        valid = np.flatnonzero(finite)
         if len(valid) > most:
-            valid = valid[np.linspace(0, len(valid) - 1, most).round().astype(int)]
+            chosen = np.linspace(0, len(valid) - 1, most)
+            valid = valid[chosen.round().astype(int)]
         pixels = np.concatenate(grey)[valid]
         return cls(joined[valid], pixels, np.concatenate(sigma)[valid])
 
@@ -180,7 +186,16 @@ def keyframe_views(scene: SceneMap) -> list[KeyframeView]:
         image = np.repeat(keyframes.grey(i)[..., None], 3, axis=-1)
         frustum = Frustum.of(pose, camera)
         depths = scale / marks.inverse_depth
-        views.append(KeyframeView(scene.name, i, frustum, camera, image, depths))
+        views.append(
+            KeyframeView(
+                scene.name,
+                i,
+                frustum,
+                camera,
+                image,
+                depths,
+            )
+        )
     return views
 
 
@@ -214,24 +229,30 @@ class Surroundings:
     def bounds(self, others: Array) -> Array:
         """(2, 3) corners of a box around the keyframes, other points, and the landmarks near by."""
         eyes = [view.base_from_camera.translation_m for view in self.keyframes]
-        points = np.concatenate([np.reshape(eyes, (-1, 3)), others])
+        centres = np.reshape(eyes, (-1, 3))
+        points = np.concatenate([centres, others])
         low = points.min(0)
         high = points.max(0)
         reach = max(float((high - low).max()), 0.1)
         if len(self.points_m):  # few landmarks lie far behind a window
-            far = np.percentile(self.points_m, [2, 98], axis=0)
-            low = np.minimum(low, np.maximum(far[0], low - reach))
-            high = np.maximum(high, np.minimum(far[1], high + reach))
-        return np.stack([low - 0.1 * reach, high + 0.1 * reach])
+            nearest, farthest = np.percentile(self.points_m, [2, 98], axis=0)
+            lowest = np.maximum(nearest, low - reach)
+            highest = np.minimum(farthest, high + reach)
+            low = np.minimum(low, lowest)
+            high = np.maximum(high, highest)
+        margin = 0.1 * reach
+        return np.stack([low - margin, high + margin])
 
 
 def ellipse(pose: UncertainPose, times: float, plane: Plane) -> Array:
     """(n, 2) outline in a plane of the ellipsoid that holds a position with 95 %, enlarged."""
-    values, vectors = np.linalg.eigh(pose.covariance[np.ix_(plane, plane)])
+    covariance = pose.covariance[np.ix_(plane, plane)]
+    values, vectors = np.linalg.eigh(covariance)
     half_axes = times * np.sqrt(CHI2_95 * values.clip(0))
     angle = np.linspace(0.0, 2 * np.pi, 181)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return pose.pose.translation_m[list(plane)] + circle * half_axes @ vectors.T
+    centre = pose.pose.translation_m[list(plane)]
+    return centre + circle * half_axes @ vectors.T
 
 
 class Axes(NamedTuple):
@@ -266,20 +287,32 @@ def view_panel(
     bounds = around.bounds(shown)
     extent = float(np.ptp(bounds, axis=0).max())
     low, high = bounds[:, plane]
-    half = np.array(size) * ((high - low) / size).max() / 2
+    scale = ((high - low) / size).max()
+    half = np.array(size) * scale / 2
     limits = (low + high) / 2 + np.stack([-half, half])
     flat = around.points_m[:, plane]
-    inside = ((flat > limits[0]) & (flat < limits[1])).all(axis=1)
+    lower, upper = limits
+    inside = ((flat > lower) & (flat < upper)).all(axis=1)
     shade = np.where(inside, around.grey // 52, -1)
     drawn = []
     for i in range(5):  # neither ink nor paper
+        points = flat[shade == i]
         opacity = 0.65 - 0.12 * i
-        drawn.append(Shape("dots", flat[shade == i], "text", 1.9, opacity))
+        drawn.append(
+            Shape(
+                "dots",
+                points,
+                "text",
+                1.9,
+                opacity,
+            )
+        )
     drawn += shapes
     for frustum in around.keyframes:
         outline = _edges(frustum, 0.04 * extent)
         drawn.append(Shape("line", outline[:, plane], "blue", 1.2))
-    ends = 0.08 * extent * np.insert(np.eye(3)[:, None], 0, 0, axis=1)
+    directions = np.eye(3)[:, None]
+    ends = 0.08 * extent * np.insert(directions, 0, 0, axis=1)
     for line, ink in zip(ends, ("red", "green", "blue"), strict=True):
         drawn.append(Shape("line", line[:, plane], ink, 2.5))
     if view is not None:

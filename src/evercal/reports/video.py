@@ -85,16 +85,22 @@ def animate(
             maps[name] = Surroundings.of(scenes[name])
     shown = next(iter(maps), None)
     for i, answer in enumerate(answers):
+        estimate = answer.estimate
         ink = "red"
-        if answer.estimate.status == "ok":
+        if estimate.status == "ok":
             ink = "green"
-            shown = answer.estimate.scene
-        frame = np.full((*_SIZE[::-1], 3), 255, np.uint8)
+            shown = estimate.scene
+        width, height = _SIZE
+        frame = np.full((height, width, 3), 255, np.uint8)
         image = read(answer.path)
-        width = min(_PICTURE[0], _PICTURE[1] * image.shape[1] // image.shape[0])
-        drawn = draw_landmarks(image, answer.estimate, localizer, width=width)
-        frame[_TOP:, _LEFT:][: len(drawn.image), :width] = drawn.image
-        write(frame, (textwrap.shorten(drawn.summary, 90), _LEFT, _TOP - 12, 0))
+        rows, columns = image.shape[:2]
+        most_width, most_height = _PICTURE
+        width = min(most_width, most_height * columns // rows)
+        drawn = draw_landmarks(image, estimate, localizer, width=width)
+        bottom = _TOP + len(drawn.image)
+        frame[_TOP:bottom, _LEFT : _LEFT + width] = drawn.image
+        summary = textwrap.shorten(drawn.summary, 90)
+        write(frame, (summary, _LEFT, _TOP - 12, 0))
         if shown is not None:
             panel = _from_above(scenes[shown], maps[shown], answers, i)
             paint(frame, panel, _PANEL_LEFT, _TOP)
@@ -112,8 +118,9 @@ def _from_above(
     view = None
     unit = "m"
     for i, answer in enumerate(answers):
-        pose = answer.estimate.base_from_camera
-        if answer.estimate.status != "ok" or answer.estimate.scene != scene.name:
+        estimate = answer.estimate
+        pose = estimate.base_from_camera
+        if estimate.status != "ok" or estimate.scene != scene.name:
             continue
         if not answer.unit_known:
             unit = "unit unknown"
@@ -121,9 +128,17 @@ def _from_above(
             eyes[i] = pose.translation_m
         if pose is not None and i == number:
             view = Frustum.of(pose, scene.adjusted_camera)
-    points = np.concatenate([np.zeros((1, 3)), eyes[np.isfinite(eyes[:, 0])]])
+    located = np.isfinite(eyes[:, 0])
+    points = np.concatenate([np.zeros((1, 3)), eyes[located]])
     path = Shape("line", eyes[: number + 1, ABOVE], "orange", 2)
-    return view_panel(_PANEL, Axes(unit=unit), around, points, view, [path])
+    return view_panel(
+        _PANEL,
+        Axes(unit=unit),
+        around,
+        points,
+        view,
+        [path],
+    )
 
 
 def _words(answer: Answer) -> str:
