@@ -24,8 +24,10 @@ BOUNDS = {
 }
 """Thresholds in metres and radians, by the name of their column."""
 
-WRONG_MM, WRONG_SIGMAS = 10.0, 5.0
-"""A wrong answer is off by more than both: millimetres, and its own standard deviations."""
+WRONG_MM = 10.0
+"""Error that a wrong answer exceeds, millimetres."""
+WRONG_SIGMAS = 5.0
+"""Mahalanobis distance that a wrong answer exceeds as well."""
 
 
 def accuracy_row(name: str, results: Sequence[FrameResult]) -> Row:

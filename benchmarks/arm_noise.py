@@ -8,8 +8,10 @@ from scipy.spatial.transform import Rotation
 from evercal.geometry import SE3
 from evercal.recordings import Recording
 
-ARM_MM, ARM_DEG = 5.0, 1.0
-"""Root mean square length of the errors of positions and rotations."""
+ARM_MM = 5.0
+"""Root mean square length of the errors of positions, millimetres."""
+ARM_DEG = 1.0
+"""Root mean square angle of the errors of rotations, degrees."""
 
 
 def arm_errors(poses: SE3, rng: np.random.Generator) -> np.ndarray:

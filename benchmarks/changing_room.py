@@ -3,7 +3,7 @@
 OUT/round-00 ... round-10       recordings: training frames of each round, and test frames
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -59,37 +59,40 @@ def _refurnished(before: Room, seed: int) -> Room:
     return replace(before, items=items)
 
 
-def render(
-    out: Path = Path("runs/changing-room"),
-    kind: str = "bedroom",
-    seed: int = 3101,
-    rounds: int = 10,
-    first: int = 60,
-    frames: int = 24,
-    samples: int = 8,
-) -> None:
-    """Render the recordings; an interrupted run continues.
+@dataclass(frozen=True)
+class Rendering:
+    """A room, its changes, and how they are rendered."""
 
-    Args:
-        out: Folder of the recordings.
-        kind: Kind of room.
-        seed: Seed of the room.
-        rounds: Rounds of change.
-        first: Frames before the first change, 70 % of them for training.
-        frames: Frames of each round, 70 % of them for training.
-        samples: Light paths per pixel.
-    """
+    kind: str = "bedroom"
+    """Kind of room."""
+    seed: int = 3101
+    """Seed of the room."""
+    rounds: int = 10
+    """Rounds of change."""
+    first: int = 60
+    """Frames before the first change, 70 % of them for training."""
+    frames: int = 24
+    """Frames of each round, 70 % of them for training."""
+    samples: int = 8
+    """Light paths per pixel."""
+
+
+def render(rendering: Rendering, out: Path = Path("runs/changing-room")) -> None:
+    """Render the recordings into a folder; an interrupted run continues."""
+    seed = rendering.seed
     camera = default_camera(320, 240)
-    done = []
-    plans = [(state, sweep_shots(state, frames if i else first, 20 + i))
-             for i, state in enumerate(states(kind, seed, rounds))]  # fmt: skip
+    plans = []
+    count = rendering.first
+    for i, state in enumerate(states(rendering.kind, seed, rendering.rounds)):
+        plans.append((state, sweep_shots(state, count, 20 + i)))
+        count = rendering.frames
     with tqdm(total=sum(len(shots) for _, shots in plans), unit="frame") as bar:
         for number, (state, shots) in enumerate(plans):
             root = out / f"round-{number:02d}"
             renderer = None
             light = float(np.random.default_rng([seed, number, 3]).uniform(-0.7, 0.7))
             options = RenderOptions(
-                samples=samples, exposure_ev=light if number else 0.0
+                samples=rendering.samples, exposure_ev=light if number else 0.0
             )
             done = []
             for i, shot in enumerate(shots):

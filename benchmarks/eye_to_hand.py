@@ -41,8 +41,12 @@ FIRST_SEED = 205
 """Seeds below it are for development."""
 ARM = (0.1, 0.02)
 """Standard deviation of the stated gripper poses per axis, millimetres and degrees."""
-CLOSED, SOLVED, HELD = "closed form", "evercal solve", "eye_to_hand"
-"""Names of the methods; the first two need the board."""
+CLOSED = "closed form"
+"""OpenCV's detection of a board and closed-form solvers."""
+SOLVED = "evercal solve"
+"""`evercal detect` of a board and `evercal solve`."""
+HELD = "eye_to_hand"
+"""`Map.eye_to_hand`, with any thing in the gripper."""
 
 
 @dataclass(frozen=True)

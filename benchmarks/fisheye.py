@@ -36,16 +36,24 @@ from rooms.paths import sweep_shots
 from rooms.renderer import Renderer, RenderOptions
 from rooms.room import room as furnished_room
 
-FIRST_SEED, FRAMES, TESTS, REPEATS = 40, 60, 15, 8
-"""Rooms; frames of a recording; images that are located; images of one fixed camera."""
+FIRST_SEED = 40
+"""Seed of the first box room."""
+FRAMES = 60
+"""Frames of a recording."""
+TESTS = 15
+"""Images of a room that are located."""
+REPEATS = 8
+"""Images of one fixed camera."""
 FURNISHED = (("bedroom", 501), ("kitchen", 502), ("living", 503))
 """Kind and seed of the rendered rooms."""
 NOISE = 3.0
 """Standard deviation of the noise of an image, of 255."""
-BOARDS, VIEWS = 10, 20
-"""Recordings of a board, and images of each."""
+BOARDS = 10
+"""Recordings of a board."""
+VIEWS = 20
+"""Images of a recording of a board."""
 ARM = (0.05, 0.01)
-"""Standard deviation of the gripper poses of those per axis, millimetres and degrees."""
+"""Standard deviation of gripper poses beside a board per axis, millimetres and degrees."""
 
 
 def lens(name: str) -> Camera:

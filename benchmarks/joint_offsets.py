@@ -35,8 +35,10 @@ FIRST_SEED = 310
 CAMERA = Camera(320, 240, 320.0, 320.0, 159.5, 119.5)
 NOISE = 2.0
 """Standard deviation of the noise of an image, of 255."""
-HELD_OUT, FIXED_IMAGES = 30, 8
-"""Poses of the gripper that no image shows; images of a fixed camera in the learned map."""
+HELD_OUT = 30
+"""Poses of the gripper that no image shows."""
+FIXED_IMAGES = 8
+"""Images of a fixed camera in the learned map."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,8 +28,21 @@ with the paper's head."""
 SEEDS = "0,1,2,3,4,5"
 """All orders of three rooms."""
 MORE_SEEDS = "0,1,2,3,4,5,6,7,8,9,10,11"
+"""All orders of three rooms, twice."""
 FEW_SEEDS = "0,1,2"
 """Three orders: each room is first, second and last once."""
+COMPARED = ("sars_spdd", "er", "sars_reprojection", "reservoir_spdd")
+"""Strategies of every experiment but that of the paper."""
+CONTRASTS = (*COMPARED, "icarl", "buff_cs", "sars_old_output")
+"""Strategies of the contrasts that were named before the runs."""
+FILLED = (*COMPARED, "sars_spdd_filled")
+"""Strategies whose memory is varied."""
+BOUNDED = (*FILLED, "joint", "finetune")
+"""The same beside joint training and fine-tuning, the best and the worst case."""
+CONTROLS = ("evercal", "evercal_network", "joint", "isolation", "finetune")
+"""Strategies without a method of continual learning."""
+PAPER = ("sars_spdd", "joint", "finetune", "icarl", "buff_cs", "gec")
+"""Strategies of the paper's table."""
 
 
 def tuned(spdd: float) -> dict[str, Strategy]:
@@ -64,76 +77,55 @@ class Experiment(Bench):
         return self.given
 
 
+def chosen(names: Sequence[str], known: Mapping[str, Strategy]) -> tuple[Strategy, ...]:
+    """Return strategies by name: those of `known`, else those of `evercal bench`."""
+    return tuple(known.get(name) or STRATEGIES[name] for name in names)
+
+
 def experiments(
     data: Path, out: Path, device: str
 ) -> Mapping[str, Sequence[Experiment]]:
     """Return the calls of every experiment, in order."""
     ours = tuned(10.0)
-    paper_head = tuned(1.0)
-    compared = ("sars_spdd", "er", "sars_reprojection", "reservoir_spdd")
-    contrasts = (*compared, "icarl", "buff_cs", "sars_old_output")
-    filled = (*compared, "sars_spdd_filled")
-    controls = ("evercal", "evercal_network", "joint", "isolation", "finetune")
-
-    def chosen(
-        names: Sequence[str], known: Mapping[str, Strategy] = ours
-    ) -> tuple[Strategy, ...]:
-        return tuple(known.get(name) or STRATEGIES[name] for name in names)
+    every = [*CONTROLS, *ours.keys() - {"sars_spdd_filled"}]
 
     def bench(suite: str, name: str, names: Sequence[str], seeds: str) -> Experiment:
-        common = Experiment(suite, data=data / suite, out=out / name, order="balanced")
-        return replace(
-            common, preset="converged", seeds=seeds, given=chosen(names), device=device
+        return Experiment(
+            suite,
+            data=data / suite,
+            out=out / name,
+            order="balanced",
+            preset="converged",
+            seeds=seeds,
+            given=chosen(names, ours),
+            device=device,
         )
 
     gate = bench("sim-mini", "networks-a", ["joint"], SEEDS)
-    head = replace(
-        bench("sim-mini", "networks-b", ["joint"], FEW_SEEDS),
-        steps=4 * STEPS,
-        backbone="paper_head",
-    )
-    unseen = replace(
-        bench("sim-unseen", "networks-c", filled, FEW_SEEDS), steps=2 * STEPS
-    )
-    paper = ("sars_spdd", "joint", "finetune", "icarl", "buff_cs", "gec")
+    head = bench("sim-mini", "networks-b", ["joint"], FEW_SEEDS)
+    head = replace(head, steps=4 * STEPS, backbone="paper_head")
+    tuned_head = chosen([*COMPARED, "finetune"], tuned(1.0))
+    unseen = bench("sim-unseen", "networks-c", BOUNDED, FEW_SEEDS)
+    unseen = replace(unseen, steps=2 * STEPS)
+    real = bench("real2", "networks-real", BOUNDED, FEW_SEEDS)
+    paper = bench("sim-unseen", "networks-paper", (), "0")
+    memory = []
+    for share in (1, 3, 30):
+        name = f"networks-memory-{share}"
+        shared = bench("sim-mini", name, FILLED, FEW_SEEDS)
+        memory.append(replace(shared, memory=f"{share}%"))
     return {
         "gate": [gate],
         "a": [
-            replace(
-                gate, given=chosen([*controls, *ours.keys() - {"sars_spdd_filled"}])
-            ),
-            replace(gate, given=chosen(contrasts), seeds=MORE_SEEDS),
+            replace(gate, given=chosen(every, ours)),
+            replace(gate, given=chosen(CONTRASTS, ours), seeds=MORE_SEEDS),
         ],
-        "memory": [
-            replace(
-                bench("sim-mini", f"networks-memory-{share}", filled, FEW_SEEDS),
-                memory=f"{share}%",
-            )
-            for share in (1, 3, 30)
-        ],
-        "b": [head, replace(head, given=chosen([*compared, "finetune"], paper_head))],
-        "c": [
-            replace(unseen, given=chosen([*filled, "joint", "finetune"])),
-            replace(unseen, given=chosen(["evercal"]), seeds="0"),
-        ],
-        "real": [
-            replace(
-                bench(
-                    "real2", "networks-real", [*filled, "joint", "finetune"], FEW_SEEDS
-                ),
-                steps=2 * STEPS,
-            )
-        ],
+        "memory": memory,
+        "b": [head, replace(head, given=tuned_head)],
+        "c": [unseen, replace(unseen, given=chosen(["evercal"], ours), seeds="0")],
+        "real": [replace(real, steps=2 * STEPS)],
         "paper": [
-            replace(
-                Experiment(
-                    "sim-unseen", data=data / "sim-unseen", out=out / "networks-paper"
-                ),
-                preset="paper",
-                seeds="0",
-                given=tuple(STRATEGIES[name] for name in paper),
-                device=device,
-            )
+            replace(paper, preset="paper", order=Bench.order, given=chosen(PAPER, {}))
         ],
     }
 
@@ -159,6 +151,7 @@ def run(
         raise InputError(
             f"{' '.join(unknown) or 'no experiment'}: choose of {', '.join(known)}"
         )
-    for experiment in (experiment for name in names for experiment in known[name]):
-        experiment.run()
+    for name in names:
+        for experiment in known[name]:
+            experiment.run()
     return 0

@@ -38,10 +38,16 @@ from evercal.storage.stages import STAGES
 from evercal.storage.tensors import load_tensors, save_tensors
 
 FIRST_SEED = 30_000
-KEYFRAMES, QUERIES, QUERIED = 50, 5, 100
-"""Keyframes of a scene; queries of each of the first scenes."""
+KEYFRAMES = 50
+"""Keyframes of a scene."""
+QUERIES = 5
+"""Query images of a scene that has some."""
+QUERIED = 100
+"""Scenes that have query images: the first ones."""
 TEXTURE_PX = 192
+"""Side of the textures of a room, pixels."""
 SIDE = 240
+"""Side of the encoder's input, pixels."""
 AT_ONCE = 25
 """Scenes in a file."""
 ATTEMPT = LocalizeOptions().attempts[0]

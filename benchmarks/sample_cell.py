@@ -30,8 +30,10 @@ ROOM = ("living", 22)
 WRIST_IMAGES = 60
 TRIPOD_IMAGES = 12
 JPEG_QUALITY = 85
-NOISE_M, NOISE_RAD = 0.0002, np.deg2rad(0.02)
-"""Standard deviation per axis of the noise on stated gripper poses."""
+NOISE_M = 0.0002
+"""Standard deviation per axis of stated gripper positions, metres."""
+NOISE_RAD = np.deg2rad(0.02)
+"""Standard deviation per axis of stated gripper rotations, radians."""
 BUMP_M = 0.005
 BUMP_RAD = np.deg2rad(0.3)
 

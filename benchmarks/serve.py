@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import urllib3
+from tyro.conf import OmitArgPrefixes
 
 from benchmarks.malformed import heavy, malformed
 from benchmarks.rows import Row, save
@@ -27,14 +28,26 @@ _WARM = 10
 """Requests before the first one that counts."""
 
 
+@dataclass(frozen=True)
+class Load:
+    """How many requests a service gets."""
+
+    requests: int = 200
+    """Pairs of a direct call and a request."""
+    mixed: int = 1000
+    """Requests of several clients, one in six malformed."""
+    bad: int = 5000
+    """Malformed requests, while another client asks for /health."""
+    many: int = 20_000
+    """Requests over which the memory is compared."""
+    clients: int = 8
+    """Clients that ask at the same time."""
+
+
 def run(
     store: Path,
     scenes: tuple[Path, ...],
-    requests: int = 200,
-    mixed: int = 1000,
-    bad: int = 5000,
-    many: int = 20_000,
-    clients: int = 8,
+    load: OmitArgPrefixes[Load],
     out: Path = Path("runs/serve.csv"),
 ) -> None:
     """Measure a service; the images are test images of the scenes, as they are.
@@ -42,11 +55,7 @@ def run(
     Args:
         store: Folder for a new map.
         scenes: Recordings that are learned first; one test image of each is located.
-        requests: Pairs of a direct call and a request.
-        mixed: Requests of several clients, one in six malformed.
-        bad: Malformed requests, while another client asks for /health.
-        many: Requests over which the memory is compared.
-        clients: Clients that ask at the same time.
+        load: How many requests the service gets.
         out: File of the rows.
     """
     opened = Map.open(store)
@@ -62,14 +71,14 @@ def run(
         rows.extend(measured)
         for row in measured:
             print(row, flush=True)
-        save(out, rows, {"clients": clients})
+        save(out, rows, {"clients": load.clients})
 
     with _served(store) as service:
-        keep(*_pairs(opened, service, images, requests))
-        keep(*_mixed(opened, service, images, mixed, clients))
-        keep(_bad(service, bad))
-        keep(_memory(service, images, many, clients))
-        keep(_end(service, images, clients))
+        keep(*_pairs(opened, service, images, load.requests))
+        keep(*_mixed(opened, service, images, load))
+        keep(_bad(service, load.bad))
+        keep(_memory(service, images, load))
+        keep(_end(service, images, load.clients))
 
 
 @dataclass
@@ -169,10 +178,12 @@ def _pairs(
 
 
 def _mixed(
-    opened: Map, service: _Service, images: list[bytes], count: int, clients: int
+    opened: Map, service: _Service, images: list[bytes], load: Load
 ) -> Iterator[Row]:
     """Throughput of located images, beside direct calls in as many threads as the service has."""
     threads = cores()
+    count = load.mixed
+    clients = load.clients
 
     def direct(number: int) -> None:
         opened.localize(_decoded(images[number % len(images)]))
@@ -241,18 +252,18 @@ def _bad(service: _Service, count: int) -> Row:
     }
 
 
-def _memory(service: _Service, images: list[bytes], count: int, clients: int) -> Row:
+def _memory(service: _Service, images: list[bytes], load: Load) -> Row:
     def ask(number: int) -> float:
         return _ms(lambda i: service.localize(images[i % len(images)]), number)
 
     marks = []
     times: list[float] = []
-    for part in np.array_split(np.arange(count), 20):
-        with ThreadPoolExecutor(clients) as pool:
+    for part in np.array_split(np.arange(load.many), 20):
+        with ThreadPoolExecutor(load.clients) as pool:
             times += pool.map(ask, part)
         marks.append(service.resident_mb)
         print(f"{len(times)} requests, {marks[-1]:.0f} MB", flush=True)
-    return _row(f"{clients} clients", np.array(times)) | {
+    return _row(f"{load.clients} clients", np.array(times)) | {
         "mb": marks[0],
         "peak_mb": max(marks),
     }

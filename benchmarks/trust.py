@@ -43,8 +43,10 @@ SIZES = (8, 12, 16, 25)
 """Images of the recordings of `few`."""
 FOCAL_PERCENT = (-5.0, -2.0, -0.5, 0.5, 2.0, 5.0)
 """Errors of stated focal lengths."""
-LEAST_ANSWERS, WRONG_MEDIANS = 4, 4.0
-"""Of a fitted frame: answers, and the deviation of those left out over the median one."""
+LEAST_ANSWERS = 4
+"""Answers that a fitted base frame needs."""
+WRONG_MEDIANS = 4.0
+"""Deviation of an answer that is left out of the fit, in median deviations."""
 
 
 def run(

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.board_recordings import BoardSetting, pose_pairs, record
 from benchmarks.hand_eye import Setting, error, pose, recording, rotations, shaken
-from benchmarks.mistakes import MISTAKES, OTHER, Mistake
+from benchmarks.pose_mistakes import MISTAKES, OTHER, Mistake
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve
 from evercal.errors import InputError
