@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -106,6 +107,40 @@ def violations(root: Path) -> list[str]:
     return lines
 
 
+def circle(root: Path) -> list[str]:
+    """A circle of imports between files, or between subfolders of a folder.
+
+    For subfolders, each is one thing, and so is each file beside them. A package's `__init__`
+    may import what is in it.
+    """
+    names = {
+        ".".join(("evercal", *path.relative_to(root).with_suffix("").parts))
+        for path in root.rglob("*.py")
+    }
+    files = dict[str, set[str]]()
+    rooms = dict[str, set[str]]()
+    for name in sorted(names):
+        path = root.joinpath(*name.split(".")[1:]).with_suffix(".py")
+        if path.stem in FACES:
+            continue
+        tree = ast.parse(path.read_text("utf-8"))
+        for _, parts in imported(tree, tuple(name.split(".")[:-1])):
+            longer = ".".join(parts)
+            target = longer if longer in names else longer.rpartition(".")[0]
+            if target in names:
+                files.setdefault(name, set()).add(target)
+            if target in names and name.split(".")[1] == target.split(".")[1]:
+                pair = [".".join(module.split(".")[:3]) for module in (name, target)]
+                if pair[0] != pair[1]:
+                    rooms.setdefault(pair[0], set()).add(pair[1])
+    for graph in (files, rooms):
+        try:
+            TopologicalSorter(graph).prepare()
+        except CycleError as error:
+            return error.args[1]
+    return []
+
+
 def torch_imports(root: Path) -> list[str]:
     """Modules outside `continual` that import torch, at any depth."""
     files = {
@@ -132,6 +167,24 @@ def outside_product(module: str) -> bool:
 def test_folders_import_only_from_folders_above() -> None:
     lines = violations(Path(evercal.__file__).parent)
     assert not lines, "\n" + "\n".join(lines)
+
+
+def test_no_imports_go_in_a_circle(tmp_path: Path) -> None:
+    assert circle(Path(evercal.__file__).parent) == []
+    for name, text in {
+        "maps/plain.py": "from evercal.maps import one, other",
+        "maps/one.py": "def f():\n    from evercal.maps.other import g",
+        "maps/other.py": "import evercal.maps.one",
+    }.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert {*circle(tmp_path)} == {"evercal.maps.one", "evercal.maps.other"}
+    (tmp_path / "maps/other.py").write_text("from evercal.maps.deep.low import f")
+    assert circle(tmp_path) == []
+    (tmp_path / "maps/deep").mkdir()
+    (tmp_path / "maps/deep/low.py").write_text("")
+    (tmp_path / "maps/deep/high.py").write_text("from evercal.maps.plain import x")
+    assert {*circle(tmp_path)} > {"evercal.maps.deep"}
 
 
 def test_only_networks_import_torch(tmp_path: Path) -> None:

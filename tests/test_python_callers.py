@@ -195,6 +195,15 @@ def test_objects_are_readable_in_a_notebook(cell: Map) -> None:
     )
     escaped = Calibration("eye_to_hand", SE3.identity(), np.eye(6), verdict="<b>")
     assert "&lt;b&gt;" in escaped._repr_html_()
+    pose = SE3.from_translation(np.array([1.0, 2.0, 3.0]))
+    estimate = evercal.PoseEstimate("ok", "", "hall", pose, np.eye(6), 9, 0.5, 1.0)
+    assert repr(estimate) == (
+        "PoseEstimate(status ok, scene hall, position (1.0000, 2.0000, 3.0000) in base,"
+        " standard deviation 1.00000, 57.296 deg, inliers 9)"
+    )
+    assert "<td>hall</td>" in estimate._repr_html_()
+    failed = evercal.PoseEstimate.failed("too dark")
+    assert "reason too dark" in repr(failed)
 
 
 def test_images_of_one_camera_may_be_files_or_arrays(tmp_path: Path) -> None:

@@ -1,8 +1,8 @@
 """`Map`: learned scenes, with methods to localize, track and calibrate.
 
-Learning a scene reads through four files: `Map.learn` here, `learning.scene`,
-`mapping.build.build_map`, and `mapping.store.MapStore.commit`. Methods import what they need, so
-that a robot that only locates images loads no module that learns or calibrates.
+Learning a scene reads through four files: `Map.learn` in `learning.learned_scenes`,
+`learning.scene`, `mapping.build.build_map`, and `mapping.store.MapStore.commit`. Methods import
+what they need, so that a robot that only locates images loads no module that calibrates.
 """
 
 from __future__ import annotations

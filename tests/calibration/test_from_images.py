@@ -331,7 +331,7 @@ def test_episodes_with_wrong_poses_are_reported(
     assert episodes["moved"].translation_mm == pytest.approx(30, abs=4)
     (tmp_path / "bare").mkdir()
     write_image(tmp_path / "bare" / "0.png", frame.read_image())
-    with pytest.raises(InputError, match=r"bare: states no camera pose.*--calibration"):
+    with pytest.raises(InputError, match=r"bare: states no camera pose.*`calibration`"):
         audit(localizer, tmp_path)
     (tmp_path / "bare" / "scene.json").write_text("{")
     with pytest.raises(InputError, match=r"scene\.json"):

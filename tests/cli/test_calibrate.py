@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
 from evercal.calibration.calibration import read_calibration
+from evercal.errors import with_options
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings import write_image
 
@@ -17,6 +19,11 @@ if TYPE_CHECKING:
 
 CHECK_KEYS = "moved translation_mm rotation_deg sigma_mm sigma_deg confidence same_map"
 CHECK_KEYS += " reference_from_now images left_out note"
+
+
+def printed(file: Path) -> Any:
+    """A calibration file as the command line prints it, with options."""
+    return json.loads(with_options(file.read_text()))
 
 
 def truth_of(frame: Frame) -> SE3:
@@ -57,7 +64,7 @@ def test_cameras_of_a_rig(run, hall_store, four_images, hall, tmp_path):
     )
     ran = run(*words, "--out", tmp_path / "rig.json", "--json")
     assert ran.code == 0, ran.err
-    assert ran.json == json.loads((tmp_path / "rig.json").read_text())
+    assert ran.json == printed(tmp_path / "rig.json")
     left_from_right = truth_of(hall.test[3]).inverse() @ truth_of(hall.test[6])
     text = run(*words, "--out", tmp_path / "rig.json", "--at 0,0,1").out
     assert text.count("mm at (0, 0, 1) m in the camera frame") == 2
@@ -83,7 +90,7 @@ def test_point_in_the_camera_frame_has_a_standard_deviation(
         "sigma_mm": pytest.approx(sigma),
     }
     assert record.pop("at") == expected
-    assert record == json.loads((tmp_path / "c.json").read_text())
+    assert record == printed(tmp_path / "c.json")
     assert f"{sigma:.2f} mm at (0.1, 0, 1.5) m in the camera frame" in run(*words).out
     page = (
         "report",

@@ -93,9 +93,9 @@ class LearnedScenes:
             recording: a recording or its path. Training frames are learned; test frames are not
                 read.
             name: of the scene. Default: the recording's name.
-            memory: keyframes to keep: a share of the frames ("10%"), a size ("5MB"), or "auto" for
-                the fewest that locate the recording's other frames well. Default: 10 %, at least
-                eight.
+            memory: keyframes to keep: their number (20), a share of the frames ("10%"), a size
+                ("5MB"), or "auto" for the fewest that locate the recording's other frames well.
+                Default: 10 %, at least eight.
             gripper_from_camera: a rough one, such as from CAD, that the estimate is compared with.
             options: sizes and priors of the map; `memory` overrides theirs.
             on_progress: called with the current step, how much of it is done, and its total.

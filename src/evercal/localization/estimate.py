@@ -7,6 +7,7 @@ import numpy as np
 
 from evercal.choices import Status
 from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.notebook import html_table
 
 Cause = Literal["view", "lens", "map", "stated poses", "base frame"]
 
@@ -73,3 +74,24 @@ class PoseEstimate:
         if self.base_from_camera is None or self.covariance is None:
             return None
         return UncertainPose(self.base_from_camera, self.covariance)
+
+    def __repr__(self) -> str:
+        words = [f"{name} {value}" for name, value in self._in_words().items()]
+        return f"PoseEstimate({', '.join(words)})"
+
+    def _repr_html_(self) -> str:
+        return html_table("PoseEstimate", self._in_words())
+
+    def _in_words(self) -> dict[str, str]:
+        words = {"status": self.status, "scene": self.scene or "none"}
+        pose = self.uncertain_pose
+        if pose is not None:
+            x, y, z = pose.pose.translation_m
+            position = f"({x:.4f}, {y:.4f}, {z:.4f})"
+            words["position"] = f"{position} in {self.parent_frame}"
+            variance = np.trace(pose.covariance[:3, :3]) / 3
+            sigma = f"{np.sqrt(variance):.5f}"
+            words["standard deviation"] = f"{sigma}, {pose.sigma_deg:.3f} deg"
+        if self.reason:
+            words["reason"] = self.reason
+        return words | {"inliers": str(self.inliers)}

@@ -20,8 +20,8 @@ _DIVERGED = 10.0
 _FOCAL_CHANGE = 1.0
 """Maximum change of the logarithm of the focal lengths."""
 SHARED = 0.05
-"""Variance of the error that all observations of a cell share, over the square of their variance:
-errors beyond the noise of patches, whose variance is 1, are shared more (research/map.md)."""
+"""Observations in one cell share an error of this variance, times the square of their own variance.
+The noise of patches has variance 1, so larger errors are shared more (research/map.md)."""
 SHARED_CELLS = 4
 """Number of cells along the shorter side of an image."""
 _FIXED = np.zeros(0)

@@ -20,8 +20,8 @@ _MAX_ITERATIONS = 10
 _ROUGH = 0.7
 """If the residual variance changes by more than this ratio, the pose is estimated again."""
 _REACHED = 0.05 * 7.815
-"""Probability of another camera above which the covariance includes its pose: at 5 %, its squared
-distance is the 95 % quantile of chi-squared with three degrees of freedom."""
+"""Probability times squared distance of another camera's pose above which the covariance includes
+it: 5 % at the 95 % quantile of chi-squared with three degrees of freedom."""
 
 
 @dataclass(frozen=True, eq=False)

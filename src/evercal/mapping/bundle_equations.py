@@ -21,7 +21,7 @@ SHARED = COMMON + SHIFT + INTRINSICS
 MIN_DEPTH = 0.05
 """Nearer points are projected as if they were at this depth, in units of `depth_scale`."""
 MIN_DEPTH_SUM = 1e-6
-"""Added to the diagonal of the inverse depths, which are divided by it."""
+"""Added to the information on each inverse depth, so that no division is by zero."""
 MIN_DISTORTION = 1e-4
 """Smaller changes of k1 and k2 are ignored."""
 

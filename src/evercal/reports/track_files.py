@@ -10,7 +10,7 @@ from evercal.localization.tracking import TrackedFrame
 from evercal.reports.answers import Answer, answer_row
 
 ENDINGS = (".jsonl", ".tum", ".txt")
-"""Of the names of files."""
+"""Endings of the names of files of poses."""
 _TUM_HEADER = (
     "# timestamp tx ty tz qx qy qz qw: base_from_camera, in the unit of the map\n"
 )

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 ENDING = ".mp4"
-"""Of the names of videos."""
+"""Ending of the names of videos."""
 FRAMES_A_SECOND = 10
 """Located images in a second of a video."""
 _CODEC = "vp09"

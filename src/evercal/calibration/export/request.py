@@ -152,7 +152,7 @@ def prepare_export(
     if robot is not None and not isinstance(robot, RobotPoses):
         what = "file of robot poses"
         convention = options.get("convention")
-        robot = read_robot_poses(robot, convention, what=what, option="--convention")
+        robot = read_robot_poses(robot, convention, what=what, option="`convention`")
     if target is not None and not isinstance(target, RobotPoses):
         target = read_robot_poses(target, what="file of target poses", option=None)
     return Export(calibration, name, other, robot, target, options)

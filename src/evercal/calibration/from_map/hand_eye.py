@@ -29,7 +29,7 @@ from evercal.robot.arm_offsets import ArmOffsets
 MOST_FOCAL_PERCENT = 1.0
 """A larger change of the focal length indicates errors that the covariance does not contain."""
 MOST_POSE_SIGMA_MM = 5.0
-"""The same of the standard deviation of gripper positions, millimetres."""
+"""A larger standard deviation of gripper positions indicates such errors, too; millimetres."""
 
 
 @dataclass(frozen=True, eq=False)

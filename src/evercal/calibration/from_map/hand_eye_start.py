@@ -46,7 +46,8 @@ LEAST_IMAGE_PAIRS = 6
 LEAST_SHARE = 0.3
 """Least share of the pairs that agree: before a chessboard half of them match the wrong squares."""
 SURE_SHARE = 0.8
-"""From this share of pairs that agree, no other mount is tried; of another one 0.3 may agree."""
+"""If this share of the pairs agrees, the other mount is not tried. With a wrong mount, 30 % of the
+pairs can agree."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -181,7 +181,7 @@ def _read(
         path,
         convention,
         what=f"file of {role} poses",
-        option=f"--{role}-convention",
+        option=f"`{role}_convention`",
         # Inverted, the file of the camera states board_from_camera.
         camera_from=role == "camera" and not inverted,
         robot=role == "robot",

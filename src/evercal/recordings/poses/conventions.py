@@ -87,7 +87,7 @@ class ConventionError(ValueError):
 
 @contextmanager
 def asking_for(option: str | None) -> Iterator[None]:
-    """Name the command line option, if there is one, in the message of a `ConventionError`."""
+    """Name the argument, if there is one, in the message of a `ConventionError`."""
     try:
         yield
     except ConventionError as error:
@@ -133,7 +133,7 @@ VENDORS = {
     "universal_robots": "ur",
     "motoman": "yaskawa",
 }
-"""Conventions of further vendors, whose units are millimetres and degrees."""
+"""Further vendors and the convention, with its units, that each uses."""
 KNOWN_CONVENTIONS = (
     f"{', '.join([*CONVENTIONS, *VENDORS])}, fixed_xyz or moving_zyx with any order of axes,"
     f" followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"

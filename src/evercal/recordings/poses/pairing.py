@@ -90,7 +90,7 @@ def poses_of_images(
     file: Path, images: Sequence[Path], convention: ConventionName | str | None = None
 ) -> tuple[SE3, list[str]]:
     """Read (n,) base_from_gripper of n images, with notes, for the commands with `--convention`."""
-    rows = read_robot_poses(file, convention, option="--convention")
+    rows = read_robot_poses(file, convention, option="`convention`")
     paired, notes = pair_images(images, rows, None, file)
     names = _names(images)
     poses = []

@@ -106,7 +106,7 @@ def read_robot_poses(
         convention: Convention of the numbers, such as `kuka`, `ur` or `matrix:mm`. Required if the
             file does not define it.
         what: Kind of file, for messages.
-        option: Option of the convention, such as `--convention`, for messages.
+        option: Argument of the convention in backquotes, for messages.
         camera_from: Whether the file states camera_from_something, for `:opengl`.
         robot: Whether the poses are of the robot, in files with those of the camera, too.
 
