@@ -66,7 +66,16 @@ class PoseEstimate:
     @classmethod
     def failed(cls, reason: str, milliseconds: float = 0.0) -> "PoseEstimate":
         """The answer without any pose."""
-        return cls("failed", reason, None, None, None, 0, 0.0, milliseconds)
+        return cls(
+            "failed",
+            reason,
+            None,
+            None,
+            None,
+            0,
+            0.0,
+            milliseconds,
+        )
 
     @property
     def uncertain_pose(self) -> UncertainPose | None:

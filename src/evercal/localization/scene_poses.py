@@ -49,7 +49,14 @@ class ScenePoses:
             pixels = matches.pixels[pnp.inliers]
             points = matches.points_m[pnp.inliers]
             pose = uncertain(pixels, points, camera.zoomed(factor), pnp.pose)
-            return Rough(scene, pose, pixels, points, len(pnp.inliers), count)
+            return Rough(
+                scene,
+                pose,
+                pixels,
+                points,
+                len(pnp.inliers),
+                count,
+            )
         aligned = self.aligned(query, candidate, pnp.pose, zoomed(factor))
         if aligned is None:
             return Rough.unconfirmed(scene, pnp.pose, count)
@@ -120,7 +127,14 @@ class ScenePoses:
         scene = candidate.scene
         landmarks = [self.bank.load(int(k)).landmarks for k in candidate.keyframes]
         image = SearchedImage(query.pyramid, query.camera(scene), query.priors[scene])
-        refined = align_pose(image, landmarks, start, change, options, coarse)
+        refined = align_pose(
+            image,
+            landmarks,
+            start,
+            change,
+            options,
+            coarse,
+        )
         if refined is None:
             return None
         observed = refined.observed

@@ -128,7 +128,14 @@ class Tracker:
             until = time.perf_counter() + self.options.at_most_ms / 1000
             estimate, state = self._located_in_time(image, stamp, until)
         smoothed, jumped = self._smooth(estimate, stamp)
-        return TrackedFrame(number, stamp, state, estimate, smoothed, jumped)
+        return TrackedFrame(
+            number,
+            stamp,
+            state,
+            estimate,
+            smoothed,
+            jumped,
+        )
 
     def frames(
         self, images: Iterable[np.ndarray | tuple[float, np.ndarray]]
