@@ -112,14 +112,7 @@ def refresh_scene(
     size = WorkingSize(
         cells=contents.short_side, patches=localizer.options.patches_short_side
     )
-    result = refreshed(
-        scene,
-        frames,
-        contents.encoder,
-        size,
-        options,
-        on_progress,
-    )
+    result = refreshed(scene, frames, contents.encoder, size, options, on_progress)
     scenes = [*contents.scenes]
     scenes[index] = result.scene
     after = Localizer(replace(contents, scenes=scenes), localizer.options)

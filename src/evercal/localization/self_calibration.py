@@ -56,14 +56,7 @@ def self_calibrated(
     """
     stated = prior.variances(camera)
     free = FREE.variances(camera)
-    best = minimise(
-        observed,
-        camera,
-        start,
-        _MAX_ITERATIONS,
-        stated,
-        change,
-    )
+    best = minimise(observed, camera, start, _MAX_ITERATIONS, stated, change)
     cells = cells_of(observed.pixels, camera)
     step, _ = best.moved(best.against(free))
     relaxed = best.after(step)
@@ -72,14 +65,7 @@ def self_calibrated(
     rough = not _ROUGH < relaxed.variance / best.variance < 1 / _ROUGH
     if variances is not None or doubt > prior.other_camera or rough:
         start = best.rotation, best.position
-        freed = minimise(
-            observed,
-            camera,
-            start,
-            _MAX_ITERATIONS,
-            free,
-            best.change,
-        )
+        freed = minimise(observed, camera, start, _MAX_ITERATIONS, free, best.change)
         if freed.variance < relaxed.variance:
             measured = _measured(freed, free, cells)
             doubt, variances = prior.decided(camera, freed.change, measured)
