@@ -1,14 +1,15 @@
-"""How far a reader walks: our functions that one image takes, and the changes of file."""
+"""How far a reader walks: our functions that an image or a recording takes, and changes of file."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 import evercal
+from evercal.learning.scene import learn_scene
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_map import MapContents
 from evercal.recordings.frame import Recording
@@ -20,7 +21,13 @@ MOST_CHANGES = 215
 """Calls among them of a function in another file than the one before."""
 
 
-def walked(localizer: Localizer, image: Any) -> tuple[int, int]:
+MOST_LEARNING_CALLS = 19_400
+"""The same for learning a recording of 24 frames, on the thread that asks for it."""
+MOST_LEARNING_CHANGES = 8_780
+"""Changes of file among them."""
+
+
+def walked(function: Callable[[], object]) -> tuple[int, int]:
     """Calls of our functions, comprehensions aside, and changes of file."""
     files: list[str] = []
 
@@ -32,7 +39,7 @@ def walked(localizer: Localizer, image: Any) -> tuple[int, int]:
 
     sys.setprofile(note)
     try:
-        localizer.localize(image)
+        function()
     finally:
         sys.setprofile(None)
     changes = sum(a != b for a, b in pairwise(files))
@@ -45,7 +52,16 @@ def test_an_image_takes_few_calls_and_changes_of_file(
     localizer = Localizer(hall_map)
     image = hall.test[7].read_image()
     localizer.localize(image)  # keyframes are decoded once
-    calls, changes = walked(localizer, image)
+    calls, changes = walked(lambda: localizer.localize(image))
     print(calls, "calls", changes, "changes")  # noqa: T201
     assert 100 < calls <= MOST_CALLS
     assert changes <= MOST_CHANGES
+
+
+def test_a_recording_takes_few_calls_and_changes_of_file(
+    arcs: tuple[Recording, Recording], hall_map: MapContents
+) -> None:
+    calls, changes = walked(lambda: learn_scene(arcs[0], hall_map.empty()))
+    print(calls, "calls", changes, "changes")  # noqa: T201
+    assert 100 < calls <= MOST_LEARNING_CALLS
+    assert changes <= MOST_LEARNING_CHANGES
