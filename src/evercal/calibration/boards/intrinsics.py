@@ -287,12 +287,17 @@ def _rough(
         | cv2.CALIB_FIX_K3
     )
     size = (width, height)
+    threads = cv2.getNumThreads()
+    # With more threads, the answers of OpenCV 5.0 differ from call to call in the last bits.
+    cv2.setNumThreads(1)
     try:
         _, matrix, *_ = cv2.calibrateCamera(
             points, pixels, size, camera.matrix(), np.zeros(5), flags=flags
         )
     except cv2.error:
         return camera
+    finally:
+        cv2.setNumThreads(threads)
     focal = float(matrix[0, 0])
     if not 0.1 * width < focal < 20 * width:
         return camera
