@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from benchmarks.rows import Row
+from benchmarks.rows import Row, median_of
 from evercal.evaluation.metrics import (
     COARSE,
     FINE,
@@ -44,14 +44,14 @@ def accuracy_row(name: str, results: Sequence[FrameResult]) -> Row:
         "scene": name,
         "frames": len(results),
         **{bound: 100 * float(of.mean()) for bound, of in flags.items()},
-        "median_mm": 1000 * float(np.median([r.translation_error_m for r in results])),
+        "median_mm": 1000 * median_of([r.translation_error_m for r in results]),
         "median_deg": float(
             np.rad2deg(np.median([r.rotation_error_rad for r in results]))
         ),
         "wrong_scene": sum(r.wrong_scene for r in results),
         "refused": sum(r.status != "ok" for r in results),
         "inside_95": share_inside([r.squared_mahalanobis for r in results]),
-        "ms": float(np.median([r.milliseconds for r in results])),
+        "ms": median_of([r.milliseconds for r in results]),
     }
 
 

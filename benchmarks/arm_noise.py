@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.hand_eye import rotations
 from evercal.geometry import SE3
 from evercal.recordings import Recording
 
@@ -33,8 +34,8 @@ def arm_errors(poses: SE3, rng: np.random.Generator) -> np.ndarray:
     """
     sigma = np.repeat([ARM_MM / 1000, np.deg2rad(ARM_DEG)], 3) / np.sqrt(3)
     noise = rng.normal(size=(len(poses), 6))
-    rotations = _rotations(poses)
-    turns = (rotations[1:] * rotations[:-1].inv()).as_rotvec()
+    turned = rotations(poses)
+    turns = (turned[1:] * turned[:-1].inv()).as_rotvec()
     signs = np.sign(np.c_[np.diff(poses.translation_m, axis=0), turns])
     backlash = np.r_[signs[:1], signs]
     periods = rng.uniform(1, 2, 6)
@@ -48,8 +49,8 @@ def with_arm_errors(recording: Recording, rng: np.random.Generator) -> Recording
     """Return a wrist recording whose gripper poses have the errors of a hobby arm."""
     poses = grippers(recording)
     errors = arm_errors(poses, rng)
-    rotations = Rotation.from_rotvec(errors[:, 3:]) * _rotations(poses)
-    quaternions = rotations.as_quat(canonical=True, scalar_first=True)
+    turned = Rotation.from_rotvec(errors[:, 3:]) * rotations(poses)
+    quaternions = turned.as_quat(canonical=True, scalar_first=True)
     noisy = SE3(quaternions, poses.translation_m + errors[:, :3])
     train = (
         replace(frame, base_from_gripper=pose)
@@ -62,7 +63,3 @@ def grippers(recording: Recording) -> SE3:
     """(n,) gripper poses of the training frames."""
     poses = [frame.base_from_gripper for frame in recording.train]
     return SE3.stack([pose for pose in poses if pose is not None])
-
-
-def _rotations(poses: SE3) -> Rotation:
-    return Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)

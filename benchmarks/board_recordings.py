@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.hand_eye import pose, rotations
+from benchmarks.hand_eye import pose, rotations, with_outliers
 from evercal.calibration.boards.corners import BoardView, board_pose
 from evercal.calibration.boards.intrinsics import calibrate_camera
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
@@ -125,17 +125,10 @@ def record(setting: BoardSetting, seed: int, session: int = 0) -> BoardRecording
     turned = rotations(robot) * turn
     robot = pose(turned, robot.translation_m + 1e-3 * setting.arm_mm * noise(n, 3))
     spoiled = np.sort(rng.choice(n, setting.outliers, replace=False))
-    quaternion = robot.rotation_wxyz.copy()
-    translation = robot.translation_m.copy()
-    for i in spoiled:
-        axis, direction = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
-        other = rotations(robot[i]) * Rotation.from_rotvec(np.deg2rad(20) * axis)
-        quaternion[i] = other.as_quat(scalar_first=True)
-        translation[i] += 0.05 * direction
     return BoardRecording(
         setting=setting,
         views=tuple(views),
-        base_from_gripper=SE3(quaternion, translation),
+        base_from_gripper=with_outliers(robot, spoiled, rng),
         parent_from_camera=parent_from_camera,
         fixed_from_board=fixed_from_board,
         camera=camera,

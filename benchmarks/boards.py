@@ -16,6 +16,7 @@ from benchmarks.board_images import (
     LARGE,
     TAG,
     Photo,
+    corner_points,
     render,
 )
 from benchmarks.rows import save
@@ -59,7 +60,7 @@ def detectors(board: Board) -> dict[str, Callable[[np.ndarray], np.ndarray | Non
 
         def opencv(image: np.ndarray) -> np.ndarray | None:
             pixels, ids, _, _ = detector.detectBoard(grey(image))
-            whole = (board.columns - 1) * (board.rows - 1)
+            whole = len(corner_points(board))
             return (
                 None if ids is None or len(ids) < whole else np.reshape(pixels, (-1, 2))
             )
@@ -91,7 +92,7 @@ def measure(board: Board, tilt_deg: float, count: int) -> list[dict[str, object]
         image, truth, _ = render(board, photo, seed)
         limit = np.array([camera.width, camera.height]) - 1 - _BORDER_PX
         inside = (truth.pixels > _BORDER_PX) & (truth.pixels < limit)
-        if len(truth.pixels) < _corner_count(board) or not inside.all():
+        if len(truth.pixels) < len(corner_points(board)) or not inside.all():
             continue
         images += 1
         detected = set()
@@ -120,13 +121,6 @@ def measure(board: Board, tilt_deg: float, count: int) -> list[dict[str, object]
         }
         for name in finders
     ]
-
-
-def _corner_count(board: Board) -> int:
-    if board.kind == "apriltag":
-        return 4
-    fewer = 1 if board.kind == "charuco" else 0
-    return (board.columns - fewer) * (board.rows - fewer)
 
 
 def _ordered(pixels: np.ndarray, truth: np.ndarray) -> np.ndarray:

@@ -105,11 +105,8 @@ def _learned(
     with _cluster(*nodes) as made, _processor_time(b"ray::") as spent:
         stop = threading.Event()
         killed = list[int]()
-        threads = []
         if kill:
-            threads.append(threading.Thread(target=_kill, args=(stop, killed)))
-        for thread in threads:
-            thread.start()
+            threading.Thread(target=_kill, args=(stop, killed)).start()
 
         def learned(_: object) -> None:
             if gone and len(opened.scenes) == 3:

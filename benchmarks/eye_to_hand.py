@@ -21,7 +21,7 @@ from tqdm import tqdm
 from benchmarks.accuracy import pose_error, wrong
 from benchmarks.arm_noise import grippers
 from benchmarks.hand_eye import pose
-from benchmarks.rows import Row, save
+from benchmarks.rows import Row, grouped, median_of, numbers, save
 from evercal.calibration.boards.board import Board, dictionary_of
 from evercal.calibration.boards.board_poses import board_poses
 from evercal.calibration.boards.corners import BoardView
@@ -176,13 +176,9 @@ def _measured(method: str, condition: Condition, data: Path, setting: Setting) -
         except InputError as error:
             return {"refused": str(error), "seconds": time.process_time() - began}
     seconds = time.process_time() - began
-    if isinstance(answer, dict):  # one pose by each closed-form solver
-        row: Row = {"seconds": seconds}
-        for name, found in answer.items():
-            row[f"{name}_mm"], row[f"{name}_deg"] = pose_distance_mm_deg(
-                found, true_cameras[0]
-            )
-        return row
+    if isinstance(answer, SE3):
+        mm, deg = pose_distance_mm_deg(answer, true_cameras[0])
+        return {"seconds": seconds, "Shah_mm": mm, "Shah_deg": deg}
     errors = [
         pose_error(answer.uncertain_pose, true_camera) for true_camera in true_cameras
     ]
@@ -228,10 +224,8 @@ def _poses(rows: Sequence[Mapping[str, Any]]) -> SE3:
     )
 
 
-def _from_board(
-    method: str, recording: Path, scale: float
-) -> Calibration | dict[str, SE3]:
-    """`evercal detect` and `solve`, or OpenCV's detection, solvePnP and closed-form solvers."""
+def _from_board(method: str, recording: Path, scale: float) -> Calibration | SE3:
+    """`evercal detect` and `solve`, or OpenCV's detection, solvePnP and the closed form of Shah."""
     board = replace(
         SQUARES, size_m=SQUARES.size_m * scale, marker_m=SQUARES.marker_m * scale
     )
@@ -262,7 +256,7 @@ def _from_board(
     poses = SE3.stack([camera_from_board for _, camera_from_board, _ in found])
     pairs = PosePairs(tuple(names[i] for i in rows), robot[rows], poses)
     if method == CLOSED:
-        return {"Shah": shah(pairs)}
+        return shah(pairs)
     corners = BoardCorners(
         camera, tuple(v for _, _, v in found if v is not None), stated=True
     )
@@ -310,9 +304,7 @@ def shah(pairs: PosePairs) -> SE3:
 
 def summary(rows: Sequence[Row]) -> list[Row]:
     """One row for each condition and method; `wrong`: over 10 mm and over five sigma."""
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        groups.setdefault((str(row["condition"]), str(row["method"])), []).append(row)
+    groups = grouped(rows, "condition", "method")
     return [_summary(name, method, group) for (name, method), group in groups.items()]
 
 
@@ -320,9 +312,6 @@ def _summary(name: str, method: str, group: list[Row]) -> Row:
     condition = CONDITIONS[name]
     setting = condition.setting(FIRST_SEED)
     answers = [row for row in group if "refused" not in row]
-
-    def column(key: str) -> np.ndarray:
-        return np.array([float(row[key]) for row in answers])
 
     row: Row = {
         "condition": name,
@@ -334,28 +323,20 @@ def _summary(name: str, method: str, group: list[Row]) -> Row:
     row |= {"draws": len(group), "refused": len(group) - len(answers)}
     if not answers:
         return row
-    solvers = [
-        key[:-3] for key in answers[0] if key.endswith("_mm") and method == CLOSED
-    ]
-    best = min(
-        solvers, key=lambda solver: float(np.median(column(f"{solver}_mm"))), default=""
-    )
+    prefix = "Shah_" if method == CLOSED else ""
     for unit in ("mm", "deg"):
-        errors = column(f"{best}_{unit}" if best else unit)
-        row |= {
-            unit: float(np.median(errors)),
-            f"{unit}_90": float(np.quantile(errors, 0.9)),
-        }
-    if best:
-        return row | {"solver": best}
-    squared = column("squared_mahalanobis")
+        errors = numbers(answers, prefix + unit)
+        row |= {unit: median_of(errors), f"{unit}_90": float(np.quantile(errors, 0.9))}
+    if prefix:
+        return row | {"solver": "Shah"}
+    squared = numbers(answers, "squared_mahalanobis")
     row |= {
-        f"sigma_{unit}": float(np.median(column(f"sigma_{unit}")))
+        f"sigma_{unit}": median_of(numbers(answers, f"sigma_{unit}"))
         for unit in ("mm", "deg")
     }
     row |= {
         "inside_95": share_inside(squared),
         "squared_mahalanobis": float(squared.mean()),
     }
-    row["wrong"] = int(wrong(column("mm"), squared).sum())
-    return row | {"seconds": float(np.median(column("seconds")))}
+    row["wrong"] = int(wrong(numbers(answers, "mm"), squared).sum())
+    return row | {"seconds": median_of(numbers(answers, "seconds"))}

@@ -18,7 +18,7 @@ from benchmarks.board_images import CHARUCO, Photo
 from benchmarks.board_images import render as board_photo
 from benchmarks.calibration import as_wrist_recording, learned_mount
 from benchmarks.hand_eye import pose
-from benchmarks.rows import Row, once, save
+from benchmarks.rows import Row, grouped, median_of, numbers, once, save
 from evercal.calibration.boards.board_poses import board_poses
 from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.boards.detection import find_board
@@ -46,6 +46,8 @@ REPEATS = 8
 """Images of one fixed camera."""
 FURNISHED = (("bedroom", 501), ("kitchen", 502), ("living", 503))
 """Kind and seed of the rendered rooms."""
+KINDS: dict[str | float, str] = {"box": "box", "none": ""}
+"""Kinds of rooms in the summary, by their names in rows; others are furnished."""
 NOISE = 3.0
 """Standard deviation of the noise of an image, of 255."""
 BOARDS = 10
@@ -209,24 +211,12 @@ def _board(seed: int, name: str) -> list[Row]:
 
 def summary(rows: list[Row]) -> list[Row]:
     """One row for each kind of answer, map and lens."""
-    groups: dict[tuple[str, ...], list[Row]] = {}
-    for row in rows:
-        kind = (
-            "box"
-            if row["room"] == "box"
-            else "furnished"
-            if row["answer"] != "board"
-            else ""
-        )
-        key = str(row["answer"]), kind, str(row["map"]), str(row["asked"])
-        groups.setdefault(key, []).append(row)
+    rows = [row | {"rooms": KINDS.get(row["room"], "furnished")} for row in rows]
     lines: list[Row] = []
+    groups = grouped(rows, "answer", "rooms", "map", "asked")
     for (answer, kind, learned, asked), group in groups.items():
-        located = [row for row in group if "mm" in row]
-        mm, squared = (
-            np.array([float(row[key]) for row in located])
-            for key in ("mm", "squared_mahalanobis")
-        )
+        mm = numbers(group, "mm")
+        squared = numbers(group, "squared_mahalanobis")
         line: Row = {
             "answer": answer,
             "rooms": kind,
@@ -234,7 +224,7 @@ def summary(rows: list[Row]) -> list[Row]:
             "asked": asked,
             "number": len(group),
         }
-        line |= {"located": len(located), "mm": float(np.median(mm))}
+        line |= {"located": len(mm), "mm": median_of(mm)}
         line |= {
             "mm_90": float(np.quantile(mm, 0.9)),
             "inside_95": share_inside(squared),

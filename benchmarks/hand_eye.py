@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 from tyro.conf import arg
 
-from benchmarks.rows import save
+from benchmarks.rows import median_of, save
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve
 from evercal.evaluation.metrics import share_inside
@@ -90,16 +90,22 @@ def recording(setting: Setting, seed: int) -> SimulatedPairs:
     if setting.noisy in ("camera", "both"):
         camera = shaken(camera, setting, rng)
     spoiled = np.sort(rng.choice(n, setting.outliers, replace=False))
-    quaternion = camera.rotation_wxyz.copy()
-    translation = camera.translation_m.copy()
-    for i in spoiled:
-        axis, direction = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
-        rotated = rotations(camera[i]) * Rotation.from_rotvec(np.deg2rad(20) * axis)
-        quaternion[i] = rotated.as_quat(scalar_first=True)
-        translation[i] += 0.05 * direction
-    camera = SE3(quaternion, translation / (setting.scale or 1.0))
+    camera = with_outliers(camera, spoiled, rng)
+    camera = SE3(camera.rotation_wxyz, camera.translation_m / (setting.scale or 1.0))
     pairs = PosePairs(tuple(f"row {i + 1}" for i in range(n)), robot, camera)
     return SimulatedPairs(pairs, camera_in, board_in, tuple(int(i) for i in spoiled))
+
+
+def with_outliers(poses: SE3, indices: np.ndarray, rng: np.random.Generator) -> SE3:
+    """Move some of the poses (n,) by 5 cm, and turn them by 20 degrees."""
+    quaternions = poses.rotation_wxyz.copy()
+    translations = poses.translation_m.copy()
+    for i in indices:
+        axis, direction = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+        turned = rotations(poses[i]) * Rotation.from_rotvec(np.deg2rad(20) * axis)
+        quaternions[i] = turned.as_quat(scalar_first=True)
+        translations[i] += 0.05 * direction
+    return SE3(quaternions, translations)
 
 
 def pose(rotation: Rotation, translation: np.ndarray) -> SE3:
@@ -158,13 +164,13 @@ def trials(setting: Setting, count: int, first_seed: int = 0) -> dict[str, float
                 100 * abs(result.checks.to_dict()["scale"] / setting.scale - 1)
             )
     return {
-        "median mm": float(np.median(mm)),
-        "median deg": float(np.median(deg)),
+        "median mm": median_of(mm),
+        "median deg": median_of(deg),
         "largest mm": float(max(mm)),
         "inside 95 %": share_inside(squared),
         "outliers exactly": 100 * float(np.mean(named)),
         "scale off %": float(max(scale)) if scale else float("nan"),
-        "median ms": float(np.median(ms)),
+        "median ms": median_of(ms),
         "slowest ms": float(max(ms)),
     }
 

@@ -25,14 +25,14 @@ from benchmarks.board_recordings import (
     record,
 )
 from benchmarks.hand_eye import error
-from benchmarks.rows import Row, once, save
+from benchmarks.rows import Row, median_of, once, save
 from evercal.calibration.boards.corners import lens_vector
 from evercal.calibration.boards.intrinsics import moved_camera
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.solve import solve, solve_pose_pairs
 from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside
-from evercal.geometry import SE3, pose_distance
+from evercal.geometry import SE3, pose_distance_mm_deg
 from evercal.typing import Array
 
 
@@ -129,7 +129,7 @@ def measure_sessions(name: str, count: int) -> Row:
         both = [fit.calibration() for fit in fits]
         truth = drawn[0].parent_from_camera
         squared += [b.uncertain_pose.squared_mahalanobis(truth) for b in both]
-        mm += [1000 * float(pose_distance(b.parent_from_child, truth)[0]) for b in both]
+        mm += [pose_distance_mm_deg(b.parent_from_child, truth)[0] for b in both]
         step = error(both[0].parent_from_child, both[1].parent_from_child)
         answers.append(
             step @ np.linalg.solve(both[0].covariance + both[1].covariance, step)
@@ -141,7 +141,7 @@ def measure_sessions(name: str, count: int) -> Row:
         spread = sum(f.fit.factor * f.fit.covariance[own, own] for f in fits)
         lenses.append(change @ np.linalg.solve(spread, change))
     row: Row = {"condition": name, "trials": count, "refused": refused}
-    row |= {"median_mm": float(np.median(mm)), "p95_mm": float(np.quantile(mm, 0.95))}
+    row |= {"median_mm": median_of(mm), "p95_mm": float(np.quantile(mm, 0.95))}
     row |= {"inside_95": share_inside(squared), "truth_d2": float(np.mean(squared))}
     return row | {
         "answers_d2": float(np.mean(answers)),
@@ -156,7 +156,8 @@ def measure(name: str, count: int, references: int) -> Row:
     flagged = []
     ms = []
     refused = 0
-    mm: dict[str, list[float]] = {"evercal": []}
+    mm = []
+    reference_mm = []
     for seed in range(count):
         drawn = record(setting, seed)
         pairs, corners = (
@@ -174,30 +175,18 @@ def measure(name: str, count: int, references: int) -> Row:
         flagged.append(
             any("than stated" in text for text in result.checks.to_dict()["warnings"])
         )
-        estimates = {"evercal": result.parent_from_child}
+        mm.append(pose_distance_mm_deg(result.parent_from_child, truth)[0])
         if seed < references and corners is not None:
-            start = result.parent_from_child
-            estimates["reprojection"] = reprojection(drawn, pairs, corners, start)
-        for solver, estimate in estimates.items():
-            mm.setdefault(solver, []).append(
-                1000 * float(pose_distance(estimate, truth)[0])
-            )
+            estimate = reprojection(drawn, pairs, corners, result.parent_from_child)
+            reference_mm.append(pose_distance_mm_deg(estimate, truth)[0])
     row: Row = {"condition": name, "trials": count, "refused": refused}
-    row |= {
-        "median_mm": float(np.median(mm["evercal"])),
-        "p95_mm": float(np.quantile(mm["evercal"], 0.95)),
-    }
-    row |= {
-        "inside_95": share_inside(squared),
-        "size_flagged": 100 * float(np.mean(flagged)),
-    }
-    row |= {"ms": float(np.median(ms))}
-    rest = {
-        name: float(np.median(values))
-        for name, values in mm.items()
-        if name != "evercal"
-    }
-    return row | {f"{name}_mm": value for name, value in rest.items()}
+    row |= {"median_mm": median_of(mm), "p95_mm": float(np.quantile(mm, 0.95))}
+    row["inside_95"] = share_inside(squared)
+    row["size_flagged"] = 100 * float(np.mean(flagged))
+    row["ms"] = median_of(ms)
+    if reference_mm:
+        row["reprojection_mm"] = median_of(reference_mm)
+    return row
 
 
 def run(

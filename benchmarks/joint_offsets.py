@@ -17,7 +17,7 @@ from scipy import stats
 from tqdm import tqdm
 
 from benchmarks.accuracy import pose_error
-from benchmarks.rows import Row, once, save
+from benchmarks.rows import Row, grouped, median_of, numbers, once, save
 from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside
@@ -108,9 +108,8 @@ def run(
 def robot(name: str) -> Robot:
     """The arm of a condition."""
     if name == "panda":
-        chain = [(*link, i) for i, link in enumerate(panda_arm.LINKS)]
         before = []
-        for a, d, alpha, _ in chain:
+        for a, d, alpha in panda_arm.LINKS:
             c = np.cos(alpha)
             s = np.sin(alpha)
             before.append(
@@ -342,40 +341,28 @@ def _offset_error(calibration: Calibration, offsets: np.ndarray) -> Row:
 def summary(rows: list[Row]) -> list[Row]:
     """One row for each condition and method."""
     lines: list[Row] = []
-    for key in dict.fromkeys(
-        (str(row["condition"]), str(row["method"])) for row in rows
-    ):
-        group = [row for row in rows if (row["condition"], row["method"]) == key]
+    for (condition, method), group in grouped(rows, "condition", "method").items():
         solved = [row for row in group if "mm" in row]
-        line: Row = {"condition": key[0], "method": key[1], "draws": len(group)}
+        line: Row = {"condition": condition, "method": method, "draws": len(group)}
         line["refused"] = len(group) - len(solved)
-
-        def median(name: str, of: list[Row] = solved) -> float:
-            return float(np.median([float(row[name]) for row in of if name in row]))
-
-        line |= {
-            name: median(name)
-            for name in ("gripper_before_mm", "mm", "deg", "sigma_mm")
-        }
-        another = any("fixed_mm" in row for row in solved)
-        line |= {name: median(name) for name in ("fixed_mm", "fixed_deg") if another}
-        for prefix in ("", "fixed_")[: 1 + another]:
-            squared = [float(row[f"{prefix}squared_mahalanobis"]) for row in solved]
-            line |= {
-                f"{prefix}inside_95": share_inside(squared),
-                f"{prefix}squared": float(np.mean(squared)),
-            }
-        if key[1] == "joint offsets":
-            line["gripper_after_mm"] = median("gripper_after_mm")
-            line["gripper_after_max_mm"] = max(
-                float(row["gripper_after_mm"]) for row in solved
-            )
-            line |= {name: median(name) for name in ("offset_deg", "offset_sigma_deg")}
-            inside, squared = (
-                [float(row[name]) for row in solved]
-                for name in ("offset_inside", "offset_squared")
-            )
-            line["offset_inside_95"] = 100 * float(np.mean(inside))
-            line["offset_squared"] = float(np.mean(squared))
+        medians = ["gripper_before_mm", "mm", "deg", "sigma_mm"]
+        prefixes = [""]
+        if len(numbers(solved, "fixed_mm")):
+            medians += ["fixed_mm", "fixed_deg"]
+            prefixes.append("fixed_")
+        line |= {name: median_of(numbers(solved, name)) for name in medians}
+        for prefix in prefixes:
+            squared = numbers(solved, f"{prefix}squared_mahalanobis")
+            line[f"{prefix}inside_95"] = share_inside(squared)
+            line[f"{prefix}squared"] = float(squared.mean())
+        if method == "joint offsets":
+            after = numbers(solved, "gripper_after_mm")
+            line["gripper_after_mm"] = median_of(after)
+            line["gripper_after_max_mm"] = float(after.max())
+            for name in ("offset_deg", "offset_sigma_deg"):
+                line[name] = median_of(numbers(solved, name))
+            inside = numbers(solved, "offset_inside")
+            line["offset_inside_95"] = 100 * float(inside.mean())
+            line["offset_squared"] = float(numbers(solved, "offset_squared").mean())
         lines.append(line)
     return lines

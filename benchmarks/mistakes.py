@@ -165,20 +165,11 @@ def _slipped(what: str, squares_m: tuple[float, ...], seed: int) -> Case:
     size = rng.uniform(1e-3, 1e-2), np.deg2rad(rng.uniform(0, 1))
     slip = SE3.exp(np.concatenate([s * a for s, a in zip(size, axes, strict=True)]))
     moved = slip.inverse() @ poses if what == "camera" else poses @ slip
-    late = np.arange(len(made.views)) >= row
-    made = seen_from(
-        made,
-        SE3.stack(
-            [
-                m if is_late else p
-                for p, m, is_late in zip(poses, moved, late, strict=True)
-            ]
-        ),
-    )
+    made = seen_from(made, SE3.stack([*poses][:row] + [*moved][row:]))
     pairs, corners = _pairs(made, seed)
     x = made.parent_from_camera
     pattern = rf"the ({what}|camera or board) looks moved .* before {pairs.names[row]},"
-    alone = [0] if row == 1 else [row] if row == len(late) - 1 else []
+    alone = [0] if row == 1 else [row] if row == len(poses) - 1 else []
     if alone:  # an outlier
         pattern += f"|left out: {pairs.names[alone[0]]};"
     return Case(

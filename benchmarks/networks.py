@@ -10,6 +10,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from evercal.cli.args import Device
 from evercal.cli.bench import Bench
 from evercal.continual.learning.presets import preset
 from evercal.continual.methods.gec import EpisodicConstraint
@@ -83,7 +84,7 @@ def chosen(names: Sequence[str], known: Mapping[str, Strategy]) -> tuple[Strateg
 
 
 def experiments(
-    data: Path, out: Path, device: str
+    data: Path, out: Path, device: Device
 ) -> Mapping[str, Sequence[Experiment]]:
     """Return the calls of every experiment, in order."""
     ours = tuned(10.0)
@@ -134,7 +135,7 @@ def run(
     names: Positional[tuple[str, ...]],
     data: Path = Path("runs"),
     out: Path = Path("runs"),
-    device: str = "auto",
+    device: Device = "auto",
 ) -> int:
     """Run experiments of research/protocol.md; each resumes.
 

@@ -5,9 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
 import pandas as pd
 
 from evercal.storage import write_bytes, write_json
+from evercal.typing import Array
 
 Row = dict[str, str | float]
 """A flat row of a measurement."""
@@ -45,6 +47,25 @@ def mean_row(name: str, rows: Sequence[Row]) -> Row:
     """Average the numbers of rows, ignoring NaN."""
     means = pd.DataFrame(list(rows)).mean(numeric_only=True)
     return {"scene": name, **{str(key): float(value) for key, value in means.items()}}
+
+
+def grouped(rows: Sequence[Row], *keys: str) -> dict[tuple[str, ...], list[Row]]:
+    """Rows by the values of some keys, in the order in which they first appear."""
+    groups: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        values = tuple(str(row[key]) for key in keys)
+        groups.setdefault(values, []).append(row)
+    return groups
+
+
+def numbers(rows: Sequence[Row], key: str) -> Array:
+    """Values (n,) of a key in the rows that have it."""
+    return np.array([float(row[key]) for row in rows if key in row])
+
+
+def median_of(values: Sequence[float] | Array) -> float:
+    """Median of numbers; NaN of none."""
+    return float(np.median(values))
 
 
 def once(path: Path, measure: Callable[[], Rows]) -> Rows:

@@ -31,7 +31,7 @@ class Step:
     name: str
     """Its row in the table."""
     words: tuple[str, ...]
-    """Arguments of `evercal`; results are relative paths, so that both commits print the same."""
+    """Arguments of `evercal` beside `--json`; results are relative, so that both print the same."""
     outputs: tuple[str, ...] = ()
     """Files and folders that it writes."""
 
@@ -69,26 +69,24 @@ def _sample_steps() -> Iterator[Step]:
         folder = FOLDER / room
         yield _learn(f"learn {room}", "rooms.evercal", folder)
     for room in ROOMS:
-        images = sorted(
-            str(path) for path in (FOLDER / room / "changed").rglob("*.jpg")
-        )
-        images += sorted(str(path) for path in (FOLDER / room / "images").glob("*.jpg"))
-        words = ("localize", "rooms.evercal", *images[::5], "--json")
+        images = [
+            *_images(FOLDER / room / "changed"),
+            *_images(FOLDER / room / "images"),
+        ]
+        words = ("localize", "rooms.evercal", *images[::5])
         yield Step(f"localize {room}", words)
-    fixed = str(FOLDER / "kitchen" / "calibration" / "fixed" / "images")
+    cameras = FOLDER / "kitchen" / "calibration"
+    fixed = str(cameras / "fixed" / "images")
     yield _calibrate("calibrate kitchen", "rooms.evercal", fixed)
-    bumped = str(FOLDER / "kitchen" / "calibration" / "bumped" / "images")
-    check = ("check", "rooms.evercal", bumped, "--reference", "calibration.json")
-    yield Step("check kitchen", (*check, "--json"))
+    bumped = str(cameras / "bumped" / "images")
+    yield _check("check kitchen", "rooms.evercal", bumped)
     yield _learn("learn cell", "cell.evercal", CELL / "wrist")
     yield _calibrate("calibrate tripod", "cell.evercal", str(CELL / "tripod"))
-    bumped = str(CELL / "bumped.jpg")
-    check = ("check", "cell.evercal", bumped, "--reference", "calibration.json")
-    yield Step("check tripod", (*check, "--json"))
-    images = sorted(str(path) for path in (CELL / "wrist" / "images").glob("*.jpg"))
-    yield Step("localize cell", ("localize", "cell.evercal", *images[::3], "--json"))
+    yield _check("check tripod", "cell.evercal", str(CELL / "bumped.jpg"))
+    images = _images(CELL / "wrist" / "images")
+    yield Step("localize cell", ("localize", "cell.evercal", *images[::3]))
     exported = ("export", "calibration.json", "--format", "static_transform_publisher")
-    yield Step("export tripod", (*exported, "--json"))
+    yield Step("export tripod", exported)
 
 
 def _real_steps(real: Path, out: Path) -> Iterator[Step]:
@@ -99,29 +97,37 @@ def _real_steps(real: Path, out: Path) -> Iterator[Step]:
         kitchen / f"seq-{int(name.removeprefix('sequence')):02d}" for name in test
     ]
     images = [str(path) for folder in folders for path in folder.glob("*.color.*")]
-    words = ("localize", "kitchen.evercal", *sorted(images), "--json")
+    words = ("localize", "kitchen.evercal", *sorted(images))
     yield Step("localize redkitchen", words)
     kuka = real / "handeye" / "kuka_eye_in_hand"
-    detect = ("detect", str(kuka), *BOARD, "--json")
+    detect = ("detect", str(kuka), *BOARD)
     yield Step("detect KUKA", detect, ("board.json",))
     robot = ("--robot-poses", str(kuka / "base_from_gripper.csv"))
-    solve = ("solve", *robot, "--camera-poses", "board.json", "--json")
+    solve = ("solve", *robot, "--camera-poses", "board.json")
     yield Step("solve KUKA", (*solve, "--mount", "eye_in_hand"), ("calibration.json",))
     camera = ("--camera", "board.json")
     yield _learn("learn KUKA", "kuka.evercal", kuka, *camera)
     franka = real / "handeye" / "franka_eye_to_hand"
     matrix = out / "franka.txt"
     matrix.write_text("607.593 0 323.463\n0 607.575 243.255\n0 0 1\n")
-    words = ("eye-to-hand", str(franka), "--camera", str(matrix), "--json")
+    words = ("eye-to-hand", str(franka), "--camera", str(matrix))
     yield Step("eye-to-hand Franka", words, ("calibration.json",))
 
 
 def _learn(name: str, store: str, recording: Path, *more: str) -> Step:
-    return Step(name, ("learn", store, str(recording), *more, "--json"), (store,))
+    return Step(name, ("learn", store, str(recording), *more), (store,))
 
 
 def _calibrate(name: str, store: str, images: str) -> Step:
-    return Step(name, ("calibrate", store, images, "--json"), ("calibration.json",))
+    return Step(name, ("calibrate", store, images), ("calibration.json",))
+
+
+def _check(name: str, store: str, images: str) -> Step:
+    return Step(name, ("check", store, images, "--reference", "calibration.json"))
+
+
+def _images(folder: Path) -> list[str]:
+    return sorted(map(str, folder.rglob("*.jpg")))
 
 
 def _first_frames(source: Path, copy: Path) -> Path:
@@ -168,7 +174,7 @@ def _answers(step: Step, source: Path, folder: Path) -> dict[str, object]:
     if file.exists():
         return json.loads(file.read_text())
     folder.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "evercal", *step.words]
+    command = [sys.executable, "-m", "evercal", *step.words, "--json"]
     environment = {**os.environ, "PYTHONPATH": str(source)}
     done = subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True

@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.accuracy import wrong
 from benchmarks.lenses import View, cropped
-from benchmarks.rows import save
+from benchmarks.rows import median_of, save
 from evercal.geometry import Camera, UncertainPose
 from evercal.localization.parallel import in_parallel
 from evercal.map import Map
@@ -136,9 +136,9 @@ def _summary(
     return {
         "answers": len(frames),
         "located": len(errors),
-        "median_mm": float(np.median(mm)),
+        "median_mm": median_of(mm),
         "95_%_mm": float(np.percentile(mm, 95)),
-        "sigma_mm": float(np.median(sigmas)),
+        "sigma_mm": median_of(sigmas),
         "inside_95_%": 100 * float((squared < INSIDE_95).mean()),
         "wrong": int(wrong(mm, squared).sum()),
     }

@@ -46,10 +46,10 @@ def rows_of(name: str) -> Table:
     return pd.read_csv(FOLDER / f"{name}.csv", keep_default_na=False, na_values=[""])
 
 
-def _rows(columns: str, *names: str) -> Callable[[], Table]:
+def _rows(columns: str, name: str) -> Callable[[], Table]:
 
     def table() -> Table:
-        rows: Table = pd.concat([rows_of(name) for name in names])[columns.split(",")]
+        rows = rows_of(name)[columns.split(",")]
         cells = rows.map(lambda v: f"{v:.3g}" if isinstance(v, float) else str(v))
         return cells.replace("nan", "").rename(
             columns=lambda name: name.replace("_", " ")

@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -143,7 +144,7 @@ def cases() -> dict[str, Case]:
 def lens(rooms: Sequence[Path], out: Path, images: int | None) -> list[Row]:
     """Locate test images, and calibrate the fixed camera, through every lens."""
     localizer = Localizer.open(learned(rooms, out / "rooms.evercal"))
-    jobs = [(room, name) for room in rooms for name in cases()]
+    jobs = [*product(rooms, cases())]
     rows: list[Row] = []
     for room, name in tqdm(jobs, "lenses"):
         path = out / "lens" / _file(room.name, images or "all", name)
@@ -233,14 +234,7 @@ def few(
     rooms: Sequence[Path], out: Path, draws: int, sizes: Sequence[int]
 ) -> list[Row]:
     """Calibrate a wrist camera from few images of every room."""
-    jobs = [
-        (room, size, draw) for room in rooms for size in sizes for draw in range(draws)
-    ]
-    rows = []
-    for room, size, draw in tqdm(jobs, "few images"):
-        path = out / "few" / _file(room.name, size, draw)
-        rows.append(once(path, partial(_few_draw, room, size, draw)))
-    return rows
+    return _drawn(_few_draw, [*product(rooms, sizes, range(draws))], out / "few")
 
 
 def _few_draw(room: Path, size: int, draw: int) -> Row:
@@ -278,12 +272,17 @@ def _mount(recording: Recording, truth: SE3, store: Path) -> Row:
 
 def arm(rooms: Sequence[Path], out: Path, draws: int) -> list[Row]:
     """Calibrate a wrist camera on an inaccurate arm, then a fixed camera in its map."""
+    return _drawn(_arm_draw, [*product(rooms, range(draws))], out / "arm")
+
+
+def _drawn(
+    measure: Callable[..., Row], jobs: Sequence[tuple[Any, ...]], out: Path
+) -> list[Row]:
+    """Rows of jobs, each of a room and numbers; those in files are not repeated."""
     rows = []
-    for room, draw in tqdm(
-        [(room, draw) for room in rooms for draw in range(draws)], "arms"
-    ):
-        path = out / "arm" / _file(room.name, draw)
-        rows.append(once(path, partial(_arm_draw, room, draw)))
+    for room, *numbers in tqdm(jobs, out.name):
+        path = out / _file(room.name, *numbers)
+        rows.append(once(path, partial(measure, room, *numbers)))
     return rows
 
 
