@@ -7,6 +7,7 @@ unchanged.
 from dataclasses import replace
 
 import numpy as np
+from numpy.random import Generator
 
 from rooms.furniture import Item
 from rooms.materials import Material
@@ -65,7 +66,7 @@ def relit(before: Room, seed: int) -> Room:
     return replace(before, items=items, shell=shell)
 
 
-def _factors(lamps: int, rng: np.random.Generator) -> list[float]:
+def _factors(lamps: int, rng: Generator) -> list[float]:
     """Brightness factor of each lamp; 0 is off.
 
     At least one lamp goes off, and one of several stays on. Lamps that stay on share one factor
@@ -84,7 +85,7 @@ def _dimmed(material: Material, factor: float) -> Material:
     return replace(material, name=name, emission=factor * material.emission)
 
 
-def _rearranged(before: Room, rng: np.random.Generator) -> list[Item]:
+def _rearranged(before: Room, rng: Generator) -> list[Item]:
     """The items after a share of the small ones moved or were removed."""
     small = [i for i, item in enumerate(before.items) if item.kind in SMALL]
     touched = rng.choice(small, round(CHANGED_SHARE * len(small)), replace=False)
@@ -98,9 +99,7 @@ def _rearranged(before: Room, rng: np.random.Generator) -> list[Item]:
     return [remaining[i] for i in sorted(remaining)]
 
 
-def moved_item(
-    item: Item, room: Room, rest: list[Item], rng: np.random.Generator
-) -> Item | None:
+def moved_item(item: Item, room: Room, rest: list[Item], rng: Generator) -> Item | None:
     """The item at a free position on the floor or on furniture; None after 60 failed attempts."""
     low, high = item.bounds_m()
     middle = (low + high)[:2] / 2
@@ -121,7 +120,7 @@ def moved_item(
             host, (x0, x1, y0, y1, z) = tops[rng.choice(len(tops), p=area / area.sum())]
             spot = rng.uniform((x0, y0), (x1, y1))
             z += 0.001
-        yaw = float(rng.uniform(0, 2 * np.pi))
+        yaw = rng.uniform(0, 2 * np.pi)
         moved = at_origin.placed(float(spot[0]), float(spot[1]), z, yaw)
         blocks_work = host is rest[0] and np.hypot(*(spot - _WORK_M)) < 0.16
         far = np.hypot(*(spot - middle)) >= MOVED_M

@@ -47,7 +47,7 @@ class SmallObjects:
     def mug(self) -> Item:
         """A mug with a handle."""
         r = 0.04
-        h = float(self.rng.uniform(0.085, 0.11))
+        h = self.rng.uniform(0.085, 0.11)
         body = lathe(
             [(0, 0), (0.8 * r, 0), (r, 0.012), (r, h), (r - 0.004, h), (r - 0.005, 0.01),
              (0, 0.008)], 24, 2,
@@ -60,7 +60,7 @@ class SmallObjects:
 
     def bowl(self) -> Item:
         """A bowl with up to five fruits."""
-        r = float(self.rng.uniform(0.09, 0.14))
+        r = self.rng.uniform(0.09, 0.14)
         body = lathe(
             [(0, 0), (0.4 * r, 0), (0.45 * r, 0.008), (0.85 * r, 0.05), (r, 0.085),
              (r - 0.005, 0.086), (0.8 * r, 0.052), (0, 0.014)], 32, 3,
@@ -89,8 +89,8 @@ class SmallObjects:
 
     def bottle(self) -> Item:
         """A glass bottle with a printed label."""
-        r = float(self.rng.uniform(0.032, 0.042))
-        h = float(self.rng.uniform(0.24, 0.32))
+        r = self.rng.uniform(0.032, 0.042)
+        h = self.rng.uniform(0.24, 0.32)
         body = lathe(
             [(0, 0), (0.9 * r, 0), (r, 0.01), (r, 0.55 * h), (0.85 * r, 0.65 * h),
              (0.36 * r, 0.78 * h), (0.34 * r, h), (0.4 * r, h), (0, h)], 24, 2,
@@ -103,14 +103,14 @@ class SmallObjects:
 
     def jar(self) -> Item:
         """A tin or jar with a lid and a label."""
-        r = float(self.rng.uniform(0.035, 0.055))
-        h = float(self.rng.uniform(0.09, 0.16))
+        r = self.rng.uniform(0.035, 0.055)
+        h = self.rng.uniform(0.09, 0.16)
         lid = cylinder(r * 0.98, 0.02, 0.005).shifted(0, 0, h)
         return Item("jar", [self._labelled(cylinder(r, h)), (lid, self.shop.steel)])
 
     def vase(self) -> Item:
         """A vase of random profile with up to five flowers."""
-        h = float(self.rng.uniform(0.18, 0.34))
+        h = self.rng.uniform(0.18, 0.34)
         r = self.rng.uniform(0.4, 1.0, 4) * 0.085
         body = lathe(
             [(0, 0), (r[0], 0), (r[1] + 0.02, 0.3 * h), (r[2], 0.6 * h), (0.025, 0.85 * h),
@@ -136,12 +136,12 @@ class SmallObjects:
         z = 0.0
         pile = []
         for _ in range(int(self.rng.integers(2, 6))):
-            thick = float(self.rng.uniform(0.018, 0.045))
-            upright = self.shop.book(thick, 0.16, float(self.rng.uniform(0.19, 0.25)))
+            thick = self.rng.uniform(0.018, 0.045)
+            upright = self.shop.book(thick, 0.16, self.rng.uniform(0.19, 0.25))
             lying = upright.rotated(about_y(np.pi / 2), (0, 0, thick / 2)).shifted(
                 -0.11, 0, z
             )
-            pile.append(lying.placed((0, 0, 0), float(self.rng.normal(0, 0.15))))
+            pile.append(lying.placed((0, 0, 0), self.rng.normal(0, 0.15)))
             z += thick
         return Item("books", [(Mesh.merged(pile), self._spines)])
 
@@ -152,7 +152,7 @@ class SmallObjects:
 
     def plant(self) -> Item:
         """Leaves in a pot."""
-        scale = float(self.rng.uniform(0.7, 1.3))
+        scale = self.rng.uniform(0.7, 1.3)
         pot = lathe(
             [(0, 0), (0.06, 0), (0.085, 0.12), (0.09, 0.14), (0.08, 0.14), (0.075, 0.12),
              (0, 0.12)], 28, 2,
@@ -164,11 +164,9 @@ class SmallObjects:
                 (0.16, 0.04, 0.8), (0.34, 0.08, 2.2)
             ).tolist()
             blade = leaf(length, width, droop).rotated(
-                about_y(float(self.rng.uniform(-0.7, 0.2)))
+                about_y(self.rng.uniform(-0.7, 0.2))
             )
-            leaves.append(
-                blade.placed((0, 0, 0.12), 2.4 * i + float(self.rng.normal(0, 0.2)))
-            )
+            leaves.append(blade.placed((0, 0, 0.12), 2.4 * i + self.rng.normal(0, 0.2)))
         parts = [(pot, self.glaze()), (Mesh.merged(leaves), green)]
         return Item(
             "plant", [(mesh.scaled(scale), material) for mesh, material in parts]
@@ -185,8 +183,8 @@ class SmallObjects:
 
     def pot(self) -> Item:
         """A cooking pot with a lid and two handles."""
-        r = float(self.rng.uniform(0.09, 0.12))
-        h = float(self.rng.uniform(0.1, 0.16))
+        r = self.rng.uniform(0.09, 0.12)
+        h = self.rng.uniform(0.1, 0.16)
         body = lathe(
             [(0, 0), (r - 0.01, 0), (r, 0.012), (r, h), (r + 0.004, h + 0.004),
              (r * 0.6, h + 0.02), (0, h + 0.026)], 32, 2,
@@ -222,9 +220,7 @@ class SmallObjects:
     def toy_ball(self) -> Item:
         """A patterned ball."""
         cloth = m.fabric(self.shop.name("ball"), pick(self.rng, CLOTHS), self.rng)
-        return Item(
-            "ball", [(ball(float(self.rng.uniform(0.05, 0.11)), segments=32), cloth)]
-        )
+        return Item("ball", [(ball(self.rng.uniform(0.05, 0.11), segments=32), cloth)])
 
     def blocks(self) -> Item:
         """A tower of three toy blocks."""
@@ -232,7 +228,7 @@ class SmallObjects:
         z = 0.0
         for side in (0.05, 0.045, 0.04):
             block = box(side, side, side, 0.006).placed(
-                (0, 0, z), float(self.rng.uniform(0, 1.5))
+                (0, 0, z), self.rng.uniform(0, 1.5)
             )
             parts.append((block, self.glaze()))
             z += side

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.random import Generator
 
 from rooms import materials as m
 from rooms.shapes import (
@@ -77,7 +78,7 @@ class Item:
         return Item(self.kind, parts, tops, self.curved)
 
 
-def pick(rng: np.random.Generator, colours: tuple[Colour, ...]) -> Colour:
+def pick(rng: Generator, colours: tuple[Colour, ...]) -> Colour:
     """One of the colours with a small random variation."""
     colour = np.array(colours[rng.integers(len(colours))]) * rng.uniform(0.9, 1.1)
     return tuple(np.clip(colour + rng.uniform(-0.03, 0.03, 3), 0.02, 0.95).tolist())
@@ -86,7 +87,7 @@ def pick(rng: np.random.Generator, colours: tuple[Colour, ...]) -> Colour:
 class FurnitureBuilder:
     """Makes furniture from materials that all items of a room share."""
 
-    def __init__(self, rng: np.random.Generator):
+    def __init__(self, rng: Generator):
         self.rng = rng
         self._count = 0
         self.woods = [m.wood(f"wood{i}", pick(rng, WOODS), rng) for i in range(2)]
@@ -160,9 +161,9 @@ class FurnitureBuilder:
 
     def drawers(self) -> Item:
         """A chest of drawers with round knobs."""
-        w = 0.5 + 0.5 * float(self.rng.random())
+        w = 0.5 + 0.5 * self.rng.random()
         d = 0.45
-        h = float(self.rng.uniform(0.5, 0.9))
+        h = self.rng.uniform(0.5, 0.9)
         body, front = (
             (self.wood(), self.paint) if self.rng.random() < 0.5 else (self.paint,) * 2
         )
@@ -276,8 +277,8 @@ class FurnitureBuilder:
 
     def round_table(self) -> Item:
         """A round side table on one foot."""
-        r = float(self.rng.uniform(0.28, 0.42))
-        h = float(self.rng.uniform(0.42, 0.58))
+        r = self.rng.uniform(0.28, 0.42)
+        h = self.rng.uniform(0.42, 0.58)
         top = cylinder(r, 0.03, 0.012, 40).shifted(0, -r, h - 0.03)
         foot = lathe(
             [(0, 0), (0.2, 0), (0.2, 0.015), (0.05, 0.05), (0.03, 0.2), (0.045, h - 0.1),
@@ -291,7 +292,7 @@ class FurnitureBuilder:
 
     def bookcase(self) -> Item:
         """A bookcase full of books with titles."""
-        w = float(self.rng.uniform(0.8, 1.2))
+        w = self.rng.uniform(0.8, 1.2)
         d = 0.3
         h = 1.9
         wood = self.wood()
@@ -312,12 +313,12 @@ class FurnitureBuilder:
         for i in range(rows):
             x0 = -w / 2 + 0.04
             x1 = w / 2 - 0.04
-            end = x1 - float(self.rng.uniform(0.0, 0.45)) * (x1 - x0)
+            end = x1 - self.rng.uniform(0.0, 0.45) * (x1 - x0)
             books = []
             x = x0
             while x < end:
-                thick = float(self.rng.uniform(0.018, 0.05))
-                book = self.book(thick, 0.19, float(self.rng.uniform(0.18, 0.3)))
+                thick = self.rng.uniform(0.018, 0.05)
+                book = self.book(thick, 0.19, self.rng.uniform(0.18, 0.3))
                 books.append(book.shifted(x + thick / 2, -0.15, i * gap + 0.022))
                 x += thick + 0.001
             if books:

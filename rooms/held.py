@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.random import Generator
 
 from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.printing import board_image
@@ -28,6 +29,7 @@ from evercal.simulation.panda_arm import (
 )
 from evercal.simulation.textures import dead_leaves
 from evercal.storage import write_bytes, write_json
+from evercal.typing import Array
 from rooms.changed import rearranged
 from rooms.materials import Material, fabric, label, plain, spines
 from rooms.panda import panda_meshes
@@ -96,7 +98,7 @@ class Plan:
     base_from_camera: SE3
     base_from_gripper: SE3
     gripper_from_thing: SE3
-    joints_rad: np.ndarray
+    joints_rad: Array
     """(images, 7)."""
     scale: float
     """Size of the thing in parts of `SIZES_M`."""
@@ -235,7 +237,7 @@ def make_plan(setting: Setting) -> Plan:
     raise InputError(f"seed {setting.seed}: no place for a camera; use another seed")
 
 
-def _grip(setting: Setting, scale: float, rng: np.random.Generator) -> SE3:
+def _grip(setting: Setting, scale: float, rng: Generator) -> SE3:
     """gripper_from_thing; the fingers close along the thing's y."""
     length = SIZES_M[setting.thing][2] * scale
     hand = SE3.exp([0, 0, _TIPS_M - _GRIPPED_M * scale + length / 2, 0, 0, 0])
@@ -248,12 +250,12 @@ def _arm_poses(
     setting: Setting,
     camera: Camera,
     base_from_camera: SE3,
-    middle: np.ndarray,
+    middle: Array,
     facing: float,
     gripper_from_thing: SE3,
     scale: float,
-    rng: np.random.Generator,
-) -> list[np.ndarray] | None:
+    rng: Generator,
+) -> list[Array] | None:
     """Joint angles of each image, or None where the arm reaches too few poses."""
     # z of the thing points down and its front, y, to the camera.
     y = np.array([np.cos(facing), np.sin(facing), 0.0])
@@ -292,13 +294,13 @@ def _arm_poses(
     return None
 
 
-def camera_holds(camera: Camera, pixels: np.ndarray) -> bool:
+def camera_holds(camera: Camera, pixels: Array) -> bool:
     """Whether pixels (n, 2) are at least 4 px inside the image."""
     high = (camera.width - 5, camera.height - 5)
     return bool(((pixels >= 4) & (pixels <= high)).all())
 
 
-def _with_break(setting: Setting, plan: Plan, rng: np.random.Generator) -> Plan:
+def _with_break(setting: Setting, plan: Plan, rng: Generator) -> Plan:
     """Let the thing slip at a random image, or bump the camera half way."""
     n = setting.images
     signs = rng.choice([-1, 1], 6) * rng.dirichlet(np.ones(3), 2).ravel() ** 0.5
@@ -364,7 +366,7 @@ def thing_parts(setting: Setting, scale: float) -> Parts:
     ]
 
 
-def _carton(size_m: tuple[float, float, float], pictures: list[np.ndarray]) -> Parts:
+def _carton(size_m: tuple[float, float, float], pictures: list[Array]) -> Parts:
     """A box with pictures on its front and back (y), sides (x), and ends (z)."""
     parts = []
     half = np.array(size_m) / 2
@@ -382,9 +384,7 @@ def _carton(size_m: tuple[float, float, float], pictures: list[np.ndarray]) -> P
     return parts
 
 
-def _print(
-    rng: np.random.Generator, rows: int, columns: int, leaves: int | None = None
-) -> np.ndarray:
+def _print(rng: Generator, rows: int, columns: int, leaves: int | None = None) -> Array:
     """A printed page: a picture with a label on it."""
     import cv2
 
@@ -397,7 +397,7 @@ def _print(
     return page
 
 
-def _bottle(length: float, rng: np.random.Generator) -> Parts:
+def _bottle(length: float, rng: Generator) -> Parts:
     """Glass with a printed label around it; its neck is in the gripper."""
     r = 0.03
     profile = []
@@ -423,7 +423,7 @@ def _bottle(length: float, rng: np.random.Generator) -> Parts:
             for mesh, material in ((body, glass), (middle, paper))]  # fmt: skip
 
 
-def _tool(rng: np.random.Generator) -> Parts:
+def _tool(rng: Generator) -> Parts:
     """A cordless drill: motor, handle in the gripper, battery."""
     tools = []
     for size, place in (
@@ -458,7 +458,7 @@ def _people(setting: Setting) -> list[Parts]:
     return people
 
 
-def _walk(plan: Plan, seed: list[int]) -> np.ndarray:
+def _walk(plan: Plan, seed: list[int]) -> Array:
     """base_from_person: beyond the arm, in the camera's view."""
     rng = np.random.default_rng(seed)
     camera = plan.base_from_camera[0]
@@ -473,7 +473,7 @@ def _walk(plan: Plan, seed: list[int]) -> np.ndarray:
     return matrix
 
 
-def _moved(parts: Parts, matrix: np.ndarray) -> Parts:
+def _moved(parts: Parts, matrix: Array) -> Parts:
     rotation = matrix[:3, :3]
     shift = matrix[:3, 3].tolist()
     return [(mesh.rotated(rotation, shift), material) for mesh, material in parts]

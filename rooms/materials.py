@@ -8,8 +8,10 @@ from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
+from numpy.random import Generator
 
 from evercal.simulation.textures import dead_leaves, one_over_f
+from evercal.typing import Array
 
 SIZE = 512
 """Side of a tiling texture in pixels."""
@@ -28,7 +30,7 @@ class Material:
 
     name: str
     """Surfaces with the same name are rendered as one mesh."""
-    texture: np.ndarray
+    texture: Array
     """sRGB bytes, shape (h, w, 3); a plain colour has shape (1, 1, 3)."""
     tile_m: float = 1.0
     """Size of one repetition, metres."""
@@ -69,7 +71,7 @@ class Material:
         return {"type": "area", "radiance": radiance, "sampling_weight": weight}
 
 
-def linear(srgb: np.ndarray) -> np.ndarray:
+def linear(srgb: Array) -> Array:
     """Convert sRGB bytes to linear values in [0, 1]."""
     value = np.asarray(srgb, float) / 255
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
@@ -90,9 +92,7 @@ GLOW = plain("glow", (1.0, 0.82, 0.58), emission=2.2)
 """The shade of a lamp that is on."""
 
 
-def wood(
-    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
-) -> Material:
+def wood(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
     """Varnished wood: grain along u, fine fibres, sometimes a knot."""
     v, u = np.mgrid[0:SIZE, 0:SIZE].astype(np.float32) / SIZE
     warp = 0.05 * _stretched(rng, 1, 6) + 0.02 * _noise(1.8, rng)
@@ -108,9 +108,7 @@ def wood(
     )
 
 
-def boards(
-    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
-) -> Material:
+def boards(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
     """A floor of staggered planks."""
     base = wood(name, rgb, rng).texture.astype(np.float32)
     picture = np.zeros_like(base)
@@ -132,7 +130,7 @@ def boards(
 def tiles(
     name: str,
     rgb: tuple[float, float, float],
-    rng: np.random.Generator,
+    rng: Generator,
     count: int,
     tile_m: float,
 ) -> Material:
@@ -165,7 +163,7 @@ def equal_tiles(
     rgb: tuple[float, float, float],
     other: tuple[float, float, float],
     tile_m: float,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Material:
     """Identical glazed tiles with grout, two along `tile_m`, in two colours like a chessboard."""
     side = SIZE // 2
@@ -181,9 +179,7 @@ def equal_tiles(
     return Material(name, _bytes(picture), tile_m, "coated", 0.12)
 
 
-def fabric(
-    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
-) -> Material:
+def fabric(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
     """Woven cloth with threads, shading and sometimes stripes, checks or dots."""
     v, u = np.mgrid[0:SIZE, 0:SIZE].astype(np.float32)
     weave = np.where(((u // 3) + (v // 3)) % 2, 1.06, 0.94)
@@ -206,7 +202,7 @@ def fabric(
             np.hypot((u % period) / period - 0.5, (v % period) / period - 0.5) < 0.24
         )
         picture = np.where(cells[..., None], other * value[..., None], picture)
-    return Material(name, _bytes(picture), float(rng.uniform(0.4, 0.7)))
+    return Material(name, _bytes(picture), rng.uniform(0.4, 0.7))
 
 
 def striped(
@@ -220,9 +216,7 @@ def striped(
     return Material(name, np.tile(_bytes(stripes), (SIZE, 1, 1)), tile_m)
 
 
-def carpet(
-    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
-) -> Material:
+def carpet(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
     """A woven rug with a border and figures that are mirrored at both axes."""
     half = dead_leaves(SIZE // 2, SIZE // 2, rng, 70).astype(np.float32) / 255
     half = 0.35 * half + 0.2 * half.mean(-1, keepdims=True) + 0.45 * np.array(rgb)
@@ -236,17 +230,13 @@ def carpet(
     return Material(name, _bytes(picture))
 
 
-def plaster(
-    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
-) -> Material:
+def plaster(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
     """A painted wall: nearly plain, with faint roller marks."""
     value = 1 + 0.018 * _noise(1.0, rng) + 0.012 * _noise(2.0, rng)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 1.5)
 
 
-def wallpaper(
-    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
-) -> Material:
+def wallpaper(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
     """Wallpaper with a repeated figure, so the same patch appears many times."""
     import cv2
 
@@ -256,40 +246,32 @@ def wallpaper(
     for _ in range(3):
         centre = tuple(int(c) for c in rng.integers(20, period - 20, 2))
         axes = (int(rng.integers(6, 18)), int(rng.integers(3, 10)))
-        cv2.ellipse(
-            cell, centre, axes, float(rng.uniform(0, 180)), 0, 360, other.tolist(), -1
-        )
+        cv2.ellipse(cell, centre, axes, rng.uniform(0, 180), 0, 360, other.tolist(), -1)
     picture = np.tile(cell, (4, 4, 1)) * (1 + 0.02 * _noise(1.0, rng))[..., None]
     return Material(name, _bytes(picture), 1.2)
 
 
-def stone(
-    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
-) -> Material:
+def stone(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
     """A polished worktop: speckles and shading."""
     speck = (rng.random((SIZE, SIZE)) < 0.16) * rng.normal(0, 0.18, (SIZE, SIZE))
     value = 1 + speck + 0.06 * _noise(1.4, rng)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 0.7, "coated", 0.12)
 
 
-def lacquer(
-    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
-) -> Material:
+def lacquer(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
     """Painted wood with brush strokes."""
     value = 1 + 0.035 * _stretched(rng, 1, 16) + 0.02 * _noise(1.6, rng)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 0.8, "coated", 0.18)
 
 
-def brushed(
-    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
-) -> Material:
+def brushed(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
     """Brushed steel."""
     value = 0.95 + 0.05 * _stretched(rng, 1, 40)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 0.5, "metal", 0.28)
 
 
 def painting(
-    name: str, rng: np.random.Generator, height: int = 256, width: int = 320
+    name: str, rng: Generator, height: int = 256, width: int = 320
 ) -> Material:
     """A painting."""
     picture = dead_leaves(height, width, rng, int(rng.integers(25, 120))).astype(
@@ -306,9 +288,7 @@ def painting(
     )
 
 
-def label(
-    name: str, rgb: tuple[float, float, float], rng: np.random.Generator
-) -> Material:
+def label(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
     """Printed packaging: a word, small print, a bar code."""
     import cv2
 
@@ -333,7 +313,7 @@ BOOKS = 16
 """Number of spines in one `spines` texture."""
 
 
-def spines(name: str, rng: np.random.Generator) -> Material:
+def spines(name: str, rng: Generator) -> Material:
     """Sixteen book spines side by side, with titles that run upwards."""
     import cv2
 
@@ -398,19 +378,19 @@ def clock_face(name: str) -> Material:
 
 
 @lru_cache(maxsize=8)
-def _noise_bank(exponent: float) -> np.ndarray:
+def _noise_bank(exponent: float) -> Array:
     rng = np.random.default_rng([7, round(10 * exponent)])
     return np.stack([one_over_f(SIZE, exponent, rng) for _ in range(3)])
 
 
-def _noise(exponent: float, rng: np.random.Generator) -> np.ndarray:
+def _noise(exponent: float, rng: Generator) -> Array:
     """Tiling noise (SIZE, SIZE): one of three stored ones, shifted and flipped for speed."""
     noise = _noise_bank(exponent)[rng.integers(3)]
     noise = np.roll(noise, rng.integers(0, SIZE, 2), (0, 1))
     return noise[:: 1 - 2 * int(rng.integers(2))]
 
 
-def _stretched(rng: np.random.Generator, exponent: float, factor: int) -> np.ndarray:
+def _stretched(rng: Generator, exponent: float, factor: int) -> Array:
     """Noise stretched along u by `factor`."""
     import cv2
 
@@ -421,5 +401,5 @@ def _stretched(rng: np.random.Generator, exponent: float, factor: int) -> np.nda
     return drawn.astype(np.float32)
 
 
-def _bytes(picture: np.ndarray) -> np.ndarray:
+def _bytes(picture: Array) -> Array:
     return np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8)

@@ -13,6 +13,7 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.simulation.panda_arm import joint_frames
+from evercal.typing import Array
 from rooms.materials import Material, plain
 from rooms.shapes import Mesh
 
@@ -20,7 +21,7 @@ _MESHES = "share/example-robot-data/robots/panda_description/meshes/visual"
 
 
 def panda_meshes(
-    joints_rad: np.ndarray, opening_m: float = 0.03
+    joints_rad: Array, opening_m: float = 0.03
 ) -> list[tuple[Mesh, Material]]:
     """Meshes of the arm in the base frame, one named mesh for each colour.
 
@@ -47,7 +48,7 @@ def panda_meshes(
     return [(Mesh.merged(group), material) for material, group in groups.values()]
 
 
-def _fingers(opening_m: float) -> list[np.ndarray]:
+def _fingers(opening_m: float) -> list[Array]:
     """hand_from_finger of both fingers; the second one is the first one turned about z."""
     left = SE3.from_translation((0, opening_m, 0.0584))
     return [left.matrix(), (SE3.exp([0, 0, 0, 0, 0, np.pi]) @ left).matrix()]

@@ -14,6 +14,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.simulation.box_room import look_at
 from evercal.simulation.panda_arm import HOME_RAD
+from evercal.typing import Array
 from rooms.room import Room
 
 WORK_AREA_M = np.array([0.45, 0.0, 0.15])
@@ -36,7 +37,7 @@ class Shot:
     """Training or test."""
     base_from_camera: SE3
     """Camera pose, shape ()."""
-    joints_rad: np.ndarray
+    joints_rad: Array
     """(7,) joint angles of the arm."""
 
 
@@ -117,7 +118,7 @@ def hand_camera(seed: int) -> SE3:
     )
 
 
-def hand_joints(frames: int, seed: int) -> np.ndarray:
+def hand_joints(frames: int, seed: int) -> Array:
     """Random joint angles with the flange high and tilted over the table, shape (frames, 7).
 
     Filter them with `sees_work_area`.
@@ -137,7 +138,7 @@ def sees_work_area(base_from_camera: SE3) -> bool:
 
 def _arm_path(
     frames: int, seed: list[int], hold: int, cycles: float | None = None
-) -> np.ndarray:
+) -> Array:
     """Joint angles around the ready position, constant for `hold` frames, shape (frames, 7)."""
     rng = np.random.default_rng(seed)
     step = np.arange(frames) // hold * hold
@@ -159,7 +160,7 @@ def _free_path(room: Room, frames: int, seed: list[int]) -> SE3:
     raise InputError(f"{room.kind} {room.seed}: no free camera path; use another seed")
 
 
-def is_clear(room: Room, points: np.ndarray) -> np.ndarray:
+def is_clear(room: Room, points: Array) -> Array:
     """Whether points (n, 3) are outside all objects and outside the arm's reach above its table."""
     near_arm = np.linalg.norm(points - (0.2, 0.0, 0.45), axis=-1) < 0.62
     return room.is_free(points) & ~near_arm
@@ -170,7 +171,7 @@ def _sweep(frames: int, rng: np.random.Generator) -> SE3:
     cycles = 1.0 + frames / 500
     t = np.linspace(0, 2 * np.pi * cycles, max(frames, 2), endpoint=False)[:frames]
 
-    def wave(low: float, high: float, speed: float) -> np.ndarray:
+    def wave(low: float, high: float, speed: float) -> Array:
         phase = rng.uniform(0, 2 * np.pi, 2)
         mix = 0.7 * np.sin(speed * t + phase[0]) + 0.3 * np.sin(
             2.6 * speed * t + phase[1]

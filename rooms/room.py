@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from evercal.typing import Array
 from rooms import materials as m
 from rooms.clutter import SmallObjects
 from rooms.furniture import FurnitureBuilder, Item
@@ -45,12 +46,12 @@ class Room:
     """Walls, floor, ceiling, windows and lamps."""
     items: list[Item]
     """Furniture and small objects."""
-    low_m: np.ndarray
+    low_m: Array
     """Lowest corner, shape (3,)."""
-    high_m: np.ndarray
+    high_m: Array
     """Highest corner, shape (3,)."""
 
-    def boxes_m(self) -> np.ndarray:
+    def boxes_m(self) -> Array:
         """Bounding boxes of all items, shape (n, 2, 3)."""
         return np.stack([item.bounds_m() for item in self.items])
 
@@ -58,7 +59,7 @@ class Room:
         """All meshes with their materials."""
         return self.shell + [part for item in self.items for part in item.parts]
 
-    def is_free(self, points_m: np.ndarray, margin_m: float = 0.12) -> np.ndarray:
+    def is_free(self, points_m: Array, margin_m: float = 0.12) -> Array:
         """Whether points (n, 3) are inside the room and outside all items, with a margin."""
         inside = (points_m > self.low_m + margin_m) & (
             points_m < self.high_m - margin_m
@@ -82,7 +83,7 @@ class _Builder:
         self.trinkets = SmallObjects(self.shop)
         self.hangings = WallObjects(self.shop)
         self.items: list[Item] = []
-        self.blocked: list[tuple[Item | None, np.ndarray]] = []
+        self.blocked: list[tuple[Item | None, Array]] = []
 
     def add(self, item: Item, gap_m: float = 0.03, host: Item | None = None) -> bool:
         """Add an item unless it overlaps another one (except its host) or leaves the room."""
@@ -122,7 +123,7 @@ class _Builder:
         item = make()
         for _ in range(30):
             wall = int(self.rng.choice(walls))
-            if self.along_wall(item, wall, float(self.rng.random()), z):
+            if self.along_wall(item, wall, self.rng.random(), z):
                 return True
         return False
 
@@ -132,9 +133,9 @@ class _Builder:
             for _ in range(count):
                 thing = makes[self.rng.integers(len(makes))]()
                 for _ in range(6):
-                    x = float(self.rng.uniform(x0, x1))
-                    y = float(self.rng.uniform(y0, y1))
-                    yaw = float(self.rng.uniform(0, 2 * np.pi))
+                    x = self.rng.uniform(x0, x1)
+                    y = self.rng.uniform(y0, y1)
+                    yaw = self.rng.uniform(0, 2 * np.pi)
                     if self.add(thing.placed(x, y, z + 0.001, yaw), 0.004, item):
                         break
 
@@ -177,7 +178,7 @@ def _small_things(t: SmallObjects, kind: str) -> list[Callable[[], Item]]:
     return [*both, t.lamp, t.toy_ball, t.blocks, t.radio, t.bowl, t.bottle]
 
 
-def _robot_table(build: _Builder, base: np.ndarray, repeated: bool) -> float:
+def _robot_table(build: _Builder, base: Array, repeated: bool) -> float:
     """Add the robot's table with small objects around the work area, and return its height."""
     height = 0.74
     table = build.shop.table(1.5, 0.95, height).placed(
@@ -215,7 +216,7 @@ def _robot_table(build: _Builder, base: np.ndarray, repeated: bool) -> float:
             x = base[0] + build.rng.uniform(-0.35, 0.98)
             y = base[1] + build.rng.uniform(-0.42, 0.42)
             near = np.hypot(x - base[0] - 0.45, y - base[1]) < 0.16
-            yaw = float(build.rng.uniform(0, 6))
+            yaw = build.rng.uniform(0, 6)
             placed = thing.placed(float(x), float(y), height + 0.001, yaw)
             if not near and build.add(placed, 0.01, table):
                 break
@@ -336,9 +337,7 @@ def _few_landmarks(build: _Builder) -> None:
     build.try_wall(hangings.clock, (0, 1, 2), 1.85)
     build.try_wall(hangings.wall_shelf, (0, 2), 1.4)
     for _ in range(4):
-        build.try_wall(
-            hangings.picture, (0, 1, 2, 3), float(build.rng.uniform(1.25, 1.6))
-        )
+        build.try_wall(hangings.picture, (0, 1, 2, 3), build.rng.uniform(1.25, 1.6))
 
 
 def _fill_up(build: _Builder) -> None:
@@ -351,15 +350,11 @@ def _fill_up(build: _Builder) -> None:
     drawers = shop.drawers
     for make in (drawers, chair, shop.floor_lamp, shop.round_table, chair, drawers):
         build.try_wall(make, (0, 2, 3))
-    build.try_wall(build.hangings.clock, (0, 1, 2), float(rng.uniform(1.75, 1.95)))
+    build.try_wall(build.hangings.clock, (0, 1, 2), rng.uniform(1.75, 1.95))
     for _ in range(3):
-        build.try_wall(
-            build.hangings.wall_shelf, (0, 1, 2), float(rng.uniform(1.3, 1.6))
-        )
+        build.try_wall(build.hangings.wall_shelf, (0, 1, 2), rng.uniform(1.3, 1.6))
     for _ in range(9):
-        build.try_wall(
-            build.hangings.picture, (0, 1, 1, 2, 3), float(rng.uniform(1.25, 1.6))
-        )
+        build.try_wall(build.hangings.picture, (0, 1, 1, 2, 3), rng.uniform(1.25, 1.6))
     for make in (t.plant, t.basket, t.toy_ball, t.basket, t.plant):
         thing = make()
         if thing.kind == "plant":  # larger than on tables
@@ -401,7 +396,7 @@ def _shell(build: _Builder, kind: str) -> list[tuple[Mesh, m.Material]]:
     for px in (0.008, x - 0.008):
         slabs.append((box(0.016, y, 0.08, 0.006).shifted(px, y / 2, 0), shop.white))
     for wall, low, high in ((0, 0.45, 0.75), (2, 0.2, 0.5), (3, 0.3, 0.7)):
-        slabs += _window(build, wall, float(rng.uniform(low, high)))
+        slabs += _window(build, wall, rng.uniform(low, high))
     # A broad ceiling lamp keeps shadows soft and noise low.
     lamp = m.plain("lamp", (1.0, 0.95, 0.87), emission=5.0)
     slabs.append(
@@ -430,7 +425,7 @@ def _window(build: _Builder, wall: int, at: float) -> list[tuple[Mesh, m.Materia
     """Make a window with bars and a sill, and add curtains on both sides."""
     shop = build.shop
     rng = build.rng
-    w = float(rng.uniform(1.1, 1.5))
+    w = rng.uniform(1.1, 1.5)
     h = 1.25
     low = 0.9
     sky = m.plain("sky", (0.86, 0.93, 1.0), emission=4.2)

@@ -10,18 +10,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evercal.typing import Array
+
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Triangles with smooth normals."""
 
-    vertices_m: np.ndarray
+    vertices_m: Array
     """Positions, shape (n, 3)."""
-    faces: np.ndarray
+    faces: Array
     """Vertex indices, counter-clockwise from outside, shape (m, 3)."""
-    normals: np.ndarray
+    normals: Array
     """Outward unit normals, shape (n, 3)."""
-    uv: np.ndarray
+    uv: Array
     """Texture coordinates, metres along the surface, shape (n, 2)."""
     name: str = ""
     """Name of a mesh that can be moved; empty for static meshes."""
@@ -48,7 +50,7 @@ class Mesh:
         return self.rotated(rotation, position_m)
 
     def rotated(
-        self, rotation: np.ndarray, position_m: Sequence[float] = (0, 0, 0)
+        self, rotation: Array, position_m: Sequence[float] = (0, 0, 0)
     ) -> "Mesh":
         """The mesh rotated by a (3, 3) matrix, then shifted."""
         return replace(
@@ -66,21 +68,21 @@ class Mesh:
         return replace(self, vertices_m=self.vertices_m * factor, uv=self.uv * factor)
 
 
-def about_x(angle_rad: float) -> np.ndarray:
+def about_x(angle_rad: float) -> Array:
     """Rotation matrix about x."""
     c = np.cos(angle_rad)
     s = np.sin(angle_rad)
     return np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])
 
 
-def about_y(angle_rad: float) -> np.ndarray:
+def about_y(angle_rad: float) -> Array:
     """Rotation matrix about y."""
     c = np.cos(angle_rad)
     s = np.sin(angle_rad)
     return np.array([[c, 0, s], [0, 1.0, 0], [-s, 0, c]])
 
 
-def _grid(points: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> Mesh:
+def _grid(points: Array, normals: Array, uv: Array) -> Mesh:
     """A surface through points (rows, columns, 3); normals define the outside."""
     rows, columns = points.shape[:2]
     number = np.arange(rows * columns).reshape(rows, columns)
@@ -185,7 +187,7 @@ def lampshade(*outside: tuple[float, float]) -> list[tuple[float, float]]:
     ]
 
 
-def _spline(points: np.ndarray, pieces: int) -> np.ndarray:
+def _spline(points: Array, pieces: int) -> Array:
     """A Catmull-Rom spline through points (k, 2)."""
     padded = np.concatenate([points[:1], points, points[-1:]])
     t = np.arange(pieces)[:, None] / pieces
@@ -260,7 +262,7 @@ def cushion(x: float, y: float, z: float, cells: int = 12) -> Mesh:
     return Mesh.merged(halves)
 
 
-def _normals(points: np.ndarray) -> np.ndarray:
+def _normals(points: Array) -> Array:
     """Upward unit normals of a height field (rows, columns, 3)."""
     du, dv = np.gradient(points, axis=(0, 1))
     normal = np.cross(du, dv)
@@ -283,7 +285,7 @@ def sheet(
     return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.tile(normal, (4, 1)), uv)
 
 
-def _both_sides(points: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> Mesh:
+def _both_sides(points: Array, normals: Array, uv: Array) -> Mesh:
     """A thin surface as two, 1 mm apart, because back sides are not rendered."""
     step = 5e-4 * normals
     return Mesh.merged(

@@ -32,7 +32,7 @@ class WallObjects:
     def wall_shelf(self) -> Item:
         """A board on two curved brackets."""
         shop = self.shop
-        w = float(self.rng.uniform(0.7, 1.2))
+        w = self.rng.uniform(0.7, 1.2)
         parts = [(box(w, 0.24, 0.028, 0.01, steps=3).shifted(0, -0.12, 0), shop.wood())]
         for x in (-w / 3, w / 3):
             t = np.linspace(0, np.pi / 2, 8)
@@ -70,7 +70,7 @@ class WallObjects:
     def clock(self) -> Item:
         """A round wall clock."""
         shop = self.shop
-        r = float(self.rng.uniform(0.13, 0.18))
+        r = self.rng.uniform(0.13, 0.18)
         rim = lathe(
             [
                 (r, 0),

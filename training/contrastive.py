@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
+from numpy.random import Generator
 from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import DataLoader, IterableDataset
@@ -18,6 +19,7 @@ from evercal.continual.networks.precision import autocast
 from evercal.errors import InputError
 from evercal.processes import started_safely
 from evercal.storage.atomic import write_bytes
+from evercal.typing import Array
 from rooms.renderer import mitsuba
 from training.furnished import cached_furnished_views
 from training.network import TEACHER, LocalEncoder
@@ -82,7 +84,7 @@ class PretrainData:
     """Rendered training data."""
 
     rooms: Sequence[Views]
-    pictures: list[np.ndarray]
+    pictures: list[Array]
     furnished: Sequence[Views] = ()
 
 
@@ -97,7 +99,7 @@ class Batch(NamedTuple):
     """(b, points) bool; pairs may have fewer points."""
 
 
-def _picture(seed: int) -> np.ndarray:
+def _picture(seed: int) -> Array:
     return leaf_picture(np.random.default_rng([seed, 3]))
 
 
@@ -166,14 +168,14 @@ class PairStream(IterableDataset):
         grey = torch.from_numpy(images[:, :, None]).float() / 255
         return Batch(grey, torch.from_numpy(pixels), torch.from_numpy(valid))
 
-    def _parallax(self, rooms: Sequence[Views], rng: np.random.Generator) -> Pair:
+    def _parallax(self, rooms: Sequence[Views], rng: Generator) -> Pair:
         """Draw two views of one part of a room."""
         views = rooms[int(rng.integers(len(rooms)))]
         anchor = PER_ANCHOR * rng.integers(len(views.images) // PER_ANCHOR)
         first, second = anchor + rng.choice(PER_ANCHOR, 2, replace=False)
         return view_pair(views, int(first), int(second), rng)
 
-    def _picture(self, rng: np.random.Generator) -> np.ndarray:
+    def _picture(self, rng: Generator) -> Array:
         return self.data.pictures[rng.integers(len(self.data.pictures))]
 
     def __iter__(self) -> Iterator[Batch]:

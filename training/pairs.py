@@ -4,11 +4,13 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.random import Generator
 
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.simulation.box_room import BoxRoom, look_at
 from evercal.simulation.textures import dead_leaves
+from evercal.typing import Array
 
 HEIGHT = 192
 WIDTH = 256
@@ -25,9 +27,9 @@ VALIDATION_ROOM_SEED = FIRST_ROOM_SEED + 7_000
 class Pair:
     """Two grey images with corresponding pixels."""
 
-    images: np.ndarray
+    images: Array
     """(2, HEIGHT, WIDTH) uint8."""
-    pixels: np.ndarray
+    pixels: Array
     """(2, n, 2) float32 pixels (u, v); row k is one surface point in both images."""
 
 
@@ -36,13 +38,13 @@ def pinhole(focal: float) -> Camera:
     return Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 
 
-def cell_pixels() -> np.ndarray:
+def cell_pixels() -> Array:
     """Return the centres (u, v) of the stride-8 cells, ((HEIGHT / 8) (WIDTH / 8), 2)."""
     v, u = np.mgrid[0 : HEIGHT // 8, 0 : WIDTH // 8]
     return np.stack([u, v], -1).reshape(-1, 2) * 8.0 + 3.5
 
 
-def inside(pixels: np.ndarray, margin: float = 3.5) -> np.ndarray:
+def inside(pixels: Array, margin: float = 3.5) -> Array:
     """Return a mask (n,) of pixels at least `margin` from the border."""
     u = pixels[:, 0]
     v = pixels[:, 1]
@@ -54,7 +56,7 @@ def inside(pixels: np.ndarray, margin: float = 3.5) -> np.ndarray:
     )
 
 
-def random_homography(side: int, rng: np.random.Generator) -> np.ndarray:
+def random_homography(side: int, rng: Generator) -> Array:
     """Draw a (3, 3) homography from image pixels to pixels of a square picture."""
     import cv2
 
@@ -76,7 +78,7 @@ def random_homography(side: int, rng: np.random.Generator) -> np.ndarray:
     )
 
 
-def homography_pair(picture: np.ndarray, rng: np.random.Generator) -> Pair:
+def homography_pair(picture: Array, rng: Generator) -> Pair:
     """Warp one grey (s, s) uint8 picture to two random perspective views."""
     import cv2
 
@@ -101,18 +103,18 @@ def homography_pair(picture: np.ndarray, rng: np.random.Generator) -> Pair:
 class Views(Protocol):
     """Views of one room; each group of `PER_ANCHOR` consecutive views shows the same part."""
 
-    images: np.ndarray
+    images: Array
     """(n, HEIGHT, WIDTH) uint8 grey."""
     base_from_camera: SE3
     """(n,) poses."""
     cameras: tuple[Camera, ...]
     """n pinhole cameras; the focal length differs between anchors."""
 
-    def hit(self, view: int, pixels: np.ndarray) -> np.ndarray:
+    def hit(self, view: int, pixels: Array) -> Array:
         """Return the (n, 3) surface points at (n, 2) pixels of a view; NaN without a surface."""
         ...
 
-    def visible(self, view: int, points_m: np.ndarray) -> np.ndarray:
+    def visible(self, view: int, points_m: Array) -> Array:
         """Return a mask (n,) of points (n, 3) within the image that no surface occludes."""
         ...
 
@@ -121,19 +123,19 @@ class Views(Protocol):
 class RoomViews:
     """`Views` of a box room."""
 
-    images: np.ndarray
+    images: Array
     base_from_camera: SE3
     cameras: tuple[Camera, ...]
     geometry: BoxRoom
     """The room without its textures, which would use much memory."""
 
-    def hit(self, view: int, pixels: np.ndarray) -> np.ndarray:
+    def hit(self, view: int, pixels: Array) -> Array:
         """Intersect rays with surfaces; see `Views`."""
         pose = self.base_from_camera[view]
         rays = self.cameras[view].unproject(pixels) @ pose.rotation_matrix().T
         return self.geometry.intersect(pose.translation_m, rays)[0]
 
-    def visible(self, view: int, points_m: np.ndarray) -> np.ndarray:
+    def visible(self, view: int, points_m: Array) -> Array:
         """Test for occlusion; see `Views`."""
         eye = self.base_from_camera[view].translation_m
         _, depth = self.geometry.intersect(eye, points_m - eye)
@@ -172,7 +174,7 @@ def room_views(seed: int, anchors: int = 5, per_anchor: int = PER_ANCHOR) -> Roo
     return RoomViews(np.stack(images), SE3.stack(poses), tuple(cameras), room)
 
 
-def view_pair(views: Views, first: int, second: int, rng: np.random.Generator) -> Pair:
+def view_pair(views: Views, first: int, second: int, rng: Generator) -> Pair:
     """Compute corresponding pixels of two views of a room, without occluded points."""
     pixels = cell_pixels() + rng.uniform(-3.5, 3.5, (HEIGHT * WIDTH // 64, 2))
     points = views.hit(first, pixels)
@@ -186,7 +188,7 @@ def view_pair(views: Views, first: int, second: int, rng: np.random.Generator) -
     return Pair(images, np.stack([pixels[keep], projected[keep]]).astype(np.float32))
 
 
-def photometric(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def photometric(image: Array, rng: Generator) -> Array:
     """Change exposure, contrast, gamma, shading, blur and noise at random; uint8."""
     import cv2
 
@@ -214,7 +216,7 @@ def photometric(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return (np.clip(x, 0, 1) * 255).astype(np.uint8)
 
 
-def leaf_picture(rng: np.random.Generator, side: int = 448) -> np.ndarray:
+def leaf_picture(rng: Generator, side: int = 448) -> Array:
     """Draw a grey (side, side) uint8 dead-leaves picture."""
     import cv2
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
+from numpy.random import Generator
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -24,9 +25,7 @@ TEMPERATURE = 0.07
 
 
 @torch.inference_mode()
-def _encode(
-    encoder: LocalEncoder, rooms: Sequence[Views], rng: np.random.Generator
-) -> Tensor:
+def _encode(encoder: LocalEncoder, rooms: Sequence[Views], rng: Generator) -> Tensor:
     """Encode all views with random photometric changes.
 
     Returns:
@@ -42,7 +41,7 @@ def _encode(
     return torch.stack(maps).unflatten(1, (-1, PER_ANCHOR))
 
 
-def random_crop(maps: Tensor, rng: np.random.Generator) -> Tensor:
+def random_crop(maps: Tensor, rng: Generator) -> Tensor:
     """Crop a random window of the feature grid, to vary the field of view."""
     height, width = maps.shape[-2:]
     h = rng.integers(int(0.7 * height), height + 1)
