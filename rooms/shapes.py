@@ -31,12 +31,14 @@ class Mesh:
     @classmethod
     def merged(cls, meshes: Sequence["Mesh"]) -> "Mesh":
         """Merge meshes into one with the name of the first."""
-        starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
+        faces = []
+        start = 0
+        for mesh in meshes:
+            faces.append(mesh.faces + start)
+            start += len(mesh.vertices_m)
         return cls(
             np.concatenate([mesh.vertices_m for mesh in meshes]),
-            np.concatenate(
-                [m.faces + start for m, start in zip(meshes, starts, strict=False)]
-            ),
+            np.concatenate(faces),
             np.concatenate([mesh.normals for mesh in meshes]),
             np.concatenate([mesh.uv for mesh in meshes]),
             meshes[0].name,
@@ -61,7 +63,7 @@ class Mesh:
 
     def shifted(self, x: float, y: float, z: float) -> "Mesh":
         """The mesh shifted by (x, y, z) metres."""
-        return replace(self, vertices_m=self.vertices_m + np.array([x, y, z]))
+        return replace(self, vertices_m=np.add(self.vertices_m, (x, y, z)))
 
     def scaled(self, factor: float) -> "Mesh":
         """The mesh scaled about the origin; its pattern keeps its size in metres."""
@@ -75,6 +77,10 @@ def about_x(angle_rad: float) -> Array:
     return np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])
 
 
+FORWARD = about_x(np.pi / 2)
+"""Rotation that turns z, the axis of a body of revolution, to -y, the front of furniture."""
+
+
 def about_y(angle_rad: float) -> Array:
     """Rotation matrix about y."""
     c = np.cos(angle_rad)
@@ -82,17 +88,36 @@ def about_y(angle_rad: float) -> Array:
     return np.array([[c, 0, s], [0, 1.0, 0], [-s, 0, c]])
 
 
+def mirrored(x: float) -> tuple[float, float]:
+    """Two places that are symmetric to x = 0."""
+    return -x, x
+
+
+def positions(*coordinates: ArrayLike) -> Array:
+    """Points (..., n) from n coordinates, each an array or one number for all points."""
+    return np.stack(np.broadcast_arrays(*coordinates), -1)
+
+
+def _unit(vectors: Array) -> Array:
+    """Vectors (..., n) scaled to length 1; zeros stay zeros."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.maximum(length, 1e-12)
+
+
+def _arc_length(path: Array) -> Array:
+    """Distance from the first of the points (n, d) along their path, shape (n, 1)."""
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=-1)
+    return np.concatenate([[0], np.cumsum(steps)])[:, None]
+
+
 def _grid(points: Array, normals: Array, uv: Array) -> Mesh:
     """A surface through points (rows, columns, 3); normals define the outside."""
     rows, columns = points.shape[:2]
     number = np.arange(rows * columns).reshape(rows, columns)
     a = number[:-1, :-1]
-    b = number[:-1, 1:]
     c = number[1:, 1:]
-    d = number[1:, :-1]
-    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).reshape(
-        -1, 3
-    )
+    halves = [positions(a, number[:-1, 1:], c), positions(a, c, number[1:, :-1])]
+    faces = np.concatenate(halves).reshape(-1, 3)
     vertices = points.reshape(-1, 3)
     flat = normals.reshape(-1, 3)
     corners = vertices[faces]
@@ -117,32 +142,26 @@ def box(
     """
     half = np.array([x, y, z]) / 2
     radius = min(bevel_m, 0.499 * min(x, y, z))
+    inner = half - radius
+    ring = np.tan(np.linspace(0, np.pi / 4, steps + 1)) * radius
+    # A flat face between its bevels is two triangles.
+    lines = [np.concatenate([-side - ring[::-1], side + ring]) for side in inner]
     meshes = []
-    for axis in range(3):
+    # Upright faces carry their texture upright, with v along z. Seen from outside, u runs to the
+    # right; otherwise writing would be mirrored.
+    for axis, u_axis, v_axis, right in ((0, 1, 2, 1), (1, 0, 2, -1), (2, 0, 1, 1)):
         a = (axis + 1) % 3
         b = (axis + 2) % 3
+        flat = np.empty((len(ring) * 2, len(ring) * 2, 3))
+        flat[..., a], flat[..., b] = np.meshgrid(lines[a], lines[b], indexing="ij")
         for sign in (1.0, -1.0):
             if axis == 2 and sign < 0 and not bottom:
                 continue
-            ring = np.tan(np.linspace(0, np.pi / 4, steps + 1)) * radius
-            # A flat face between its bevels is two triangles.
-            inner = half - radius
-            lines = [
-                np.concatenate([-inner[i] - ring[::-1], inner[i] + ring])
-                for i in (a, b)
-            ]
-            p = np.empty((len(lines[0]), len(lines[1]), 3))
-            p[..., axis] = sign * half[axis]
-            p[..., a], p[..., b] = np.meshgrid(*lines, indexing="ij")
-            core = np.clip(p, -(half - radius), half - radius)
-            normal = p - core
-            normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+            flat[..., axis] = sign * half[axis]
+            core = np.clip(flat, -inner, inner)
+            normal = _unit(flat - core)
             points = core + radius * normal
-            # Upright faces carry their texture upright, with v along z.
-            u_axis, v_axis = (0, 1) if axis == 2 else (1 - axis, 2)
-            # Seen from outside, u runs to the right; otherwise writing would be mirrored.
-            right = -sign if axis == 1 else sign
-            uv = np.stack([right * points[..., u_axis], points[..., v_axis]], -1)
+            uv = positions(right * sign * points[..., u_axis], points[..., v_axis])
             meshes.append(_grid(points, normal, uv))
     return Mesh.merged(meshes).shifted(0, 0, z / 2)
 
@@ -162,29 +181,21 @@ def lathe(
         points[:, 0] = np.maximum(points[:, 0], 0.0)
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     tangent = np.gradient(points, axis=0)
-    normal = np.stack([tangent[:, 1], -tangent[:, 0]], -1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    along = np.concatenate(
-        [[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))]
-    )
-    around = np.stack([np.cos(angle), np.sin(angle)], -1)
-    p = np.zeros((len(points), len(angle), 3))
-    n = np.zeros_like(p)
-    p[..., :2] = points[:, None, :1] * around
-    p[..., 2] = points[:, 1:]
-    n[..., :2] = normal[:, None, :1] * around
-    n[..., 2] = normal[:, 1:]
-    width = angle * points[:, 0].max()
-    uv = np.stack(np.broadcast_arrays(width[None, :], along[:, None]), -1)
-    return _grid(p, n, uv)
+    normal = _unit(positions(tangent[:, 1], -tangent[:, 0]))
+    uv = positions(angle * points[:, 0].max(), _arc_length(points))
+    return _grid(_revolved(points, angle), _revolved(normal, angle), uv)
+
+
+def _revolved(profile: Array, angle: Array) -> Array:
+    """Pairs (n, 2) along the radius and along z, turned about z by angles (m,): (n, m, 3)."""
+    radius = profile[:, :1]
+    return positions(radius * np.cos(angle), radius * np.sin(angle), profile[:, 1:])
 
 
 def lampshade(*outside: tuple[float, float]) -> list[tuple[float, float]]:
     """Profile of a thin wall, open below and above, from the profile of its outside."""
-    return [
-        *outside,
-        *((radius - 0.002, height) for radius, height in reversed(outside)),
-    ]
+    inside = [(radius - 0.002, height) for radius, height in reversed(outside)]
+    return [*outside, *inside]
 
 
 def _spline(points: Array, pieces: int) -> Array:
@@ -226,22 +237,16 @@ def ball(radius: float, squash: float = 1.0, segments: int = 24) -> Mesh:
 def tube(path: ArrayLike, radius: float, segments: int = 10) -> Mesh:
     """A round bar along a path (k, 3) in metres."""
     path = np.asarray(path, float)
-    tangent = np.gradient(path, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
+    tangent = _unit(np.gradient(path, axis=0))
     reference = np.array([0.0, 0.0, 1.0])
     if np.abs(tangent @ reference).max() > 0.95:
         reference = np.array([1.0, 0.3, 0.0]) / np.hypot(1, 0.3)
-    side = np.cross(tangent, reference)
-    side /= np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), 1e-9)
-    up = np.cross(side, tangent)
+    side = _unit(np.cross(tangent, reference))[:, None]
+    up = np.cross(side, tangent[:, None])
     angle = np.linspace(0, 2 * np.pi, segments + 1)
-    normal = (
-        side[:, None] * np.cos(angle)[:, None] + up[:, None] * np.sin(angle)[:, None]
-    )
-    along = np.concatenate(
-        [[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=-1))]
-    )
-    uv = np.stack(np.broadcast_arrays(angle[None, :] * radius, along[:, None]), -1)
+    uv = positions(angle * radius, _arc_length(path))
+    angle = angle[:, None]
+    normal = side * np.cos(angle) + up * np.sin(angle)
     return _grid(path[:, None] + radius * normal, normal, uv)
 
 
@@ -252,24 +257,21 @@ def cushion(x: float, y: float, z: float, cells: int = 12) -> Mesh:
     bulge = np.sqrt(np.clip((1 - u**4) * (1 - v**4), 0, 1))
     # Seams pull inwards between the corners.
     pull = 1 - 0.06 * (1 - bulge) * np.cos(u * v * np.pi / 2)
+    uv = positions(u * x / 2, v * y / 2)
     halves = []
     for sign in (1.0, -1.0):
-        p = np.stack(
-            [u * pull * x / 2, v * pull * y / 2, z / 2 * (1 + sign * bulge)], -1
-        )
-        uv = np.stack([u * x / 2, v * y / 2], -1)
+        height = z / 2 * (1 + sign * bulge)
+        p = positions(u * pull * x / 2, v * pull * y / 2, height)
         halves.append(_grid(p, sign * _normals(p), uv))
     return Mesh.merged(halves)
 
 
 def _normals(points: Array) -> Array:
     """Upward unit normals of a height field (rows, columns, 3)."""
-    du, dv = np.gradient(points, axis=(0, 1))
-    normal = np.cross(du, dv)
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    normal = np.where(
-        length > 1e-12, normal / np.maximum(length, 1e-12), (0.0, 0.0, 1.0)
-    )
+    normal = np.cross(*np.gradient(points, axis=(0, 1)))
+    degenerate = np.linalg.norm(normal, axis=-1) <= 1e-12
+    normal = _unit(normal)
+    normal[degenerate] = (0.0, 0.0, 1.0)
     return normal * np.where(normal[..., 2:].sum() < 0, -1.0, 1.0)
 
 
@@ -277,20 +279,18 @@ def sheet(
     corner_m: Sequence[float], u_m: Sequence[float], v_m: Sequence[float]
 ) -> Mesh:
     """A flat rectangle with normal u x v and texture coordinates from 0 to 1."""
-    corner, u, v = (np.asarray(value, float) for value in (corner_m, u_m, v_m))
-    normal = np.cross(u, v)
-    normal /= np.linalg.norm(normal)
+    corner, u, v = np.array([corner_m, u_m, v_m], float)
+    normal = np.tile(_unit(np.cross(u, v)), (4, 1))
     corners = np.stack([corner, corner + u, corner + u + v, corner + v])
     uv = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.tile(normal, (4, 1)), uv)
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), normal, uv)
 
 
 def _both_sides(points: Array, normals: Array, uv: Array) -> Mesh:
     """A thin surface as two, 1 mm apart, because back sides are not rendered."""
     step = 5e-4 * normals
-    return Mesh.merged(
-        [_grid(points + step, normals, uv), _grid(points - step, -normals, uv)]
-    )
+    front = _grid(points + step, normals, uv)
+    return Mesh.merged([front, _grid(points - step, -normals, uv)])
 
 
 def drape(
@@ -307,27 +307,21 @@ def drape(
         phase += 0.6 * np.sin(3 * x + np.random.default_rng(seed).uniform(0, 6))
     grid_x, grid_z = np.meshgrid(x, z, indexing="ij")
     swing = fold_m * np.sin(phase)[:, None] * (1 - 0.35 * (grid_z / height))
-    p = np.stack([grid_x, -swing, grid_z], -1)
-    du, dv = np.gradient(p, axis=(0, 1))
-    normal = np.cross(du, dv)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    return _both_sides(p, normal, np.stack([grid_x * 1.4, grid_z], -1))
+    p = positions(grid_x, -swing, grid_z)
+    normal = _unit(np.cross(*np.gradient(p, axis=(0, 1))))
+    return _both_sides(p, normal, positions(grid_x * 1.4, grid_z))
 
 
 def leaf(length: float, width: float, droop: float, cells: int = 6) -> Mesh:
     """A leaf from the origin along +x that bends down by `droop` radians."""
     t = np.linspace(0, 1, cells + 1)
     angle = 0.9 - droop * t
-    step = (
-        np.stack([np.cos(angle), np.zeros_like(t), np.sin(angle)], -1) * length / cells
-    )
+    step = positions(np.cos(angle), 0.0, np.sin(angle)) * length / cells
     spine = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)[:-1]])
     half = width / 2 * np.sin(np.pi * np.clip(t * 0.94 + 0.06, 0, 1)) ** 0.8
     across = np.array([-1.0, 0.0, 1.0])
     p = np.repeat(spine[:, None], 3, axis=1)
     p[..., 1] += half[:, None] * across
     p[..., 2] += 0.25 * half[:, None] * np.abs(across)
-    uv = np.stack(
-        np.broadcast_arrays(across[None, :] * width / 2, t[:, None] * length), -1
-    )
+    uv = positions(across * width / 2, t[:, None] * length)
     return _both_sides(p, _normals(p), uv)
