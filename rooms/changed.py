@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.random import Generator
 
-from rooms.furniture import Item
+from rooms.items import Item
 from rooms.materials import Material
 from rooms.room import Room
 

@@ -13,6 +13,9 @@ from numpy.random import Generator
 from evercal.simulation.textures import dead_leaves, one_over_f
 from evercal.typing import Array
 
+Colour = tuple[float, float, float]
+"""sRGB in [0, 1]."""
+
 SIZE = 512
 """Side of a tiling texture in pixels."""
 
@@ -78,7 +81,7 @@ def linear(srgb: Array) -> Array:
 
 
 def plain(
-    name: str, rgb: tuple[float, float, float], kind: Literal["matt", "coated", "metal"] = "matt",
+    name: str, rgb: Colour, kind: Literal["matt", "coated", "metal"] = "matt",
     roughness: float = 0.2, emission: float = 0.0,
 ) -> Material:  # fmt: skip
     """A plain colour, sRGB in [0, 1]."""
@@ -92,7 +95,7 @@ GLOW = plain("glow", (1.0, 0.82, 0.58), emission=2.2)
 """The shade of a lamp that is on."""
 
 
-def wood(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
+def wood(name: str, rgb: Colour, rng: Generator) -> Material:
     """Varnished wood: grain along u, fine fibres, sometimes a knot."""
     v, u = np.mgrid[0:SIZE, 0:SIZE].astype(np.float32) / SIZE
     warp = 0.05 * _stretched(rng, 1, 6) + 0.02 * _noise(1.8, rng)
@@ -108,7 +111,7 @@ def wood(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material
     )
 
 
-def boards(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
+def boards(name: str, rgb: Colour, rng: Generator) -> Material:
     """A floor of staggered planks."""
     base = wood(name, rgb, rng).texture.astype(np.float32)
     picture = np.zeros_like(base)
@@ -129,7 +132,7 @@ def boards(name: str, rgb: tuple[float, float, float], rng: Generator) -> Materi
 
 def tiles(
     name: str,
-    rgb: tuple[float, float, float],
+    rgb: Colour,
     rng: Generator,
     count: int,
     tile_m: float,
@@ -160,8 +163,8 @@ def tiles(
 
 def equal_tiles(
     name: str,
-    rgb: tuple[float, float, float],
-    other: tuple[float, float, float],
+    rgb: Colour,
+    other: Colour,
     tile_m: float,
     rng: Generator,
 ) -> Material:
@@ -179,7 +182,7 @@ def equal_tiles(
     return Material(name, _bytes(picture), tile_m, "coated", 0.12)
 
 
-def fabric(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
+def fabric(name: str, rgb: Colour, rng: Generator) -> Material:
     """Woven cloth with threads, shading and sometimes stripes, checks or dots."""
     v, u = np.mgrid[0:SIZE, 0:SIZE].astype(np.float32)
     weave = np.where(((u // 3) + (v // 3)) % 2, 1.06, 0.94)
@@ -207,8 +210,8 @@ def fabric(name: str, rgb: tuple[float, float, float], rng: Generator) -> Materi
 
 def striped(
     name: str,
-    rgb: tuple[float, float, float],
-    other: tuple[float, float, float],
+    rgb: Colour,
+    other: Colour,
     tile_m: float,
 ) -> Material:
     """Plain cloth with equal stripes along v in two colours; one pair of stripes is `tile_m`."""
@@ -216,7 +219,7 @@ def striped(
     return Material(name, np.tile(_bytes(stripes), (SIZE, 1, 1)), tile_m)
 
 
-def carpet(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
+def carpet(name: str, rgb: Colour, rng: Generator) -> Material:
     """A woven rug with a border and figures that are mirrored at both axes."""
     half = dead_leaves(SIZE // 2, SIZE // 2, rng, 70).astype(np.float32) / 255
     half = 0.35 * half + 0.2 * half.mean(-1, keepdims=True) + 0.45 * np.array(rgb)
@@ -230,13 +233,13 @@ def carpet(name: str, rgb: tuple[float, float, float], rng: Generator) -> Materi
     return Material(name, _bytes(picture))
 
 
-def plaster(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
+def plaster(name: str, rgb: Colour, rng: Generator) -> Material:
     """A painted wall: nearly plain, with faint roller marks."""
     value = 1 + 0.018 * _noise(1.0, rng) + 0.012 * _noise(2.0, rng)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 1.5)
 
 
-def wallpaper(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
+def wallpaper(name: str, rgb: Colour, rng: Generator) -> Material:
     """Wallpaper with a repeated figure, so the same patch appears many times."""
     import cv2
 
@@ -251,20 +254,20 @@ def wallpaper(name: str, rgb: tuple[float, float, float], rng: Generator) -> Mat
     return Material(name, _bytes(picture), 1.2)
 
 
-def stone(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
+def stone(name: str, rgb: Colour, rng: Generator) -> Material:
     """A polished worktop: speckles and shading."""
     speck = (rng.random((SIZE, SIZE)) < 0.16) * rng.normal(0, 0.18, (SIZE, SIZE))
     value = 1 + speck + 0.06 * _noise(1.4, rng)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 0.7, "coated", 0.12)
 
 
-def lacquer(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
+def lacquer(name: str, rgb: Colour, rng: Generator) -> Material:
     """Painted wood with brush strokes."""
     value = 1 + 0.035 * _stretched(rng, 1, 16) + 0.02 * _noise(1.6, rng)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 0.8, "coated", 0.18)
 
 
-def brushed(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
+def brushed(name: str, rgb: Colour, rng: Generator) -> Material:
     """Brushed steel."""
     value = 0.95 + 0.05 * _stretched(rng, 1, 40)
     return Material(name, _bytes(np.array(rgb) * value[..., None]), 0.5, "metal", 0.28)
@@ -288,7 +291,7 @@ def painting(
     )
 
 
-def label(name: str, rgb: tuple[float, float, float], rng: Generator) -> Material:
+def label(name: str, rgb: Colour, rng: Generator) -> Material:
     """Printed packaging: a word, small print, a bar code."""
     import cv2
 

@@ -15,7 +15,8 @@ import numpy as np
 from evercal.typing import Array
 from rooms import materials as m
 from rooms.clutter import SmallObjects
-from rooms.furniture import FurnitureBuilder, Item
+from rooms.furniture import FurnitureBuilder
+from rooms.items import Item
 from rooms.shapes import Mesh, about_x, box, cylinder, lathe, sheet
 from rooms.wall_objects import WallObjects
 
@@ -270,7 +271,7 @@ def _workshop(build: _Builder) -> None:
     parts = [
         (mesh.rotated(about_x(np.pi / 2)), material) for mesh, material in board.parts
     ]
-    build.try_wall(lambda: Item(board.kind, parts, curved=False), (0, 2), 1.5)
+    build.try_wall(lambda: Item(board.kind, parts), (0, 2), 1.5)
 
 
 def _canteen(build: _Builder) -> None:

@@ -8,7 +8,7 @@ import pytest
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from rooms.changed import SMALL, changed_room
-from rooms.furniture import Item
+from rooms.items import Item
 from rooms.paths import changed_shots, is_clear, sweep_shots
 from rooms.room import Room, room
 from rooms.shapes import box

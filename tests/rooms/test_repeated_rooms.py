@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rooms.furniture import Item
+from rooms.items import Item
 from rooms.materials import SIZE
 from rooms.paths import WORK_AREA_M, fixed_shots, sweep_shots
 from rooms.room import KINDS, REPEATED, Room, room
