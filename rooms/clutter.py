@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from rooms import materials as m
+from rooms import prints
 from rooms.furniture import CLOTHS, PAINTS, FurnitureBuilder, pick
 from rooms.items import Item
 from rooms.materials import Material
@@ -137,7 +138,7 @@ class SmallObjects:
     def books(self) -> Item:
         """A pile of books."""
         if self._spines is None:
-            self._spines = m.spines(self.shop.name("spines"), self.rng)
+            self._spines = prints.spines(self.shop.name("spines"), self.rng)
         z = 0.0
         pile = []
         for _ in range(self.rng.integers(2, 6)):
@@ -234,7 +235,10 @@ class SmallObjects:
         d = 9 * square_m
         print_ = sheet((-w / 2, -d / 2, 0.005), (w, 0, 0), (0, d, 0))
         board = box(w + 0.004, d + 0.004, 0.0048, 0.001)
-        parts = [(board, self.shop.white), (print_, m.chessboard("chessboard", 9, 7))]
+        parts = [
+            (board, self.shop.white),
+            (print_, prints.chessboard("chessboard", 9, 7)),
+        ]
         return Item("chessboard", parts)
 
     def basket(self) -> Item:
@@ -262,5 +266,5 @@ class SmallObjects:
         """The mesh with a printed label that covers its height and repeats around it."""
         height = np.ptp(mesh.vertices_m[:, 2])
         colour = pick(self.rng, (*CLOTHS, *PAINTS))
-        material = m.label(self.shop.name("label"), colour, self.rng)
+        material = prints.label(self.shop.name("label"), colour, self.rng)
         return replace(mesh, uv=(mesh.uv - mesh.uv.min(0)) / height), material

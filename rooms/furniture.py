@@ -6,6 +6,7 @@ import numpy as np
 from numpy.random import Generator
 
 from rooms import materials as m
+from rooms import prints
 from rooms.items import Item
 from rooms.materials import Colour, Material
 from rooms.shapes import (
@@ -225,7 +226,7 @@ class FurnitureBuilder:
         case.add(box(w, 0.012, h, 0.002), wood, 0, -0.006, 0)
         for x in mirrored(w / 2 - 0.0125):
             case.add(box(0.025, d, h, 0.005), wood, x, -d / 2, 0)
-        spines = m.spines(self.name("spines"), self.rng)
+        spines = prints.spines(self.name("spines"), self.rng)
         rows = 5
         gap = (h - 0.03) / rows
         for i in range(rows + 1):
@@ -262,13 +263,13 @@ class FurnitureBuilder:
     def book(self, thick: float, deep: float, tall: float) -> Mesh:
         """An upright book with its spine towards -y and a random cell of the `spines` texture."""
         mesh = box(thick, deep, tall, 0.003, steps=1)
-        cell = self.rng.integers(m.BOOKS)
+        cell = self.rng.integers(prints.BOOKS)
         spine = mesh.normals[:, 1] < -0.5
         x, _, z = mesh.vertices_m.T
         # Covers have the colour of the untitled edge of their spine.
         u = np.where(spine, 0.5 + 0.9 * x / thick, 0.06)
         v = np.where(spine, 0.02 + 0.96 * z / tall, 0.97)
-        return replace(mesh, uv=positions((cell + u) / m.BOOKS, v))
+        return replace(mesh, uv=positions((cell + u) / prints.BOOKS, v))
 
     def counter(self, w: float = 2.4) -> Item:
         """Kitchen base units with a worktop, a sink with a tap, a hob and an oven."""
@@ -330,7 +331,7 @@ class FurnitureBuilder:
             x = self.rng.uniform(-0.15, 0.2)
             z = self.rng.uniform(0.7, 1.55)
             note = sheet((x, -0.652, z), (0.1, 0, 0), (0, 0, 0.13))
-            paper = m.label(self.name("note"), pick(self.rng, CLOTHS), self.rng)
+            paper = prints.label(self.name("note"), pick(self.rng, CLOTHS), self.rng)
             fridge.add(note, paper)
         fridge.add_top(0.25, 0.5, 0.1, 1.8)
         return fridge

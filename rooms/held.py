@@ -31,8 +31,9 @@ from evercal.simulation.textures import dead_leaves
 from evercal.storage import write_bytes, write_json
 from evercal.typing import Array
 from rooms.changed import rearranged
-from rooms.materials import Material, fabric, label, plain, spines
+from rooms.materials import Material, fabric, plain
 from rooms.panda import panda_meshes
+from rooms.prints import label, spines
 from rooms.renderer import Renderer, RenderOptions
 from rooms.room import KINDS, RESERVED, Room, room
 from rooms.shapes import Mesh, ball, lathe, sheet

@@ -287,7 +287,7 @@ def _encode(radiance: Array, noise: float, rng: np.random.Generator) -> Array:
 def _mesh(mi: Any, mesh: Mesh, material: Material) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(material.bsdf(mi))
-    light = material.emitter(mi)
+    light = material.emitter()
     if light is not None:
         properties["emitter"] = mi.load_dict(light)
     name = mesh.name or material.name

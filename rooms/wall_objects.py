@@ -3,6 +3,7 @@
 import numpy as np
 
 from rooms import materials as m
+from rooms import prints
 from rooms.furniture import FurnitureBuilder
 from rooms.items import Item
 from rooms.shapes import (
@@ -65,7 +66,7 @@ class WallObjects:
             picture.add(box(0.03, 0.022, h, 0.008), frame, x, -0.012, 0)
         corner = (-w / 2 + 0.02, -0.008, 0.02)
         canvas = sheet(corner, (w - 0.04, 0, 0), (0, 0, h - 0.04))
-        picture.add(canvas, m.painting(shop.name("painting"), self.rng))
+        picture.add(canvas, prints.painting(shop.name("painting"), self.rng))
         return picture
 
     def clock(self) -> Item:
@@ -84,7 +85,7 @@ class WallObjects:
         face = Mesh(points, fan, np.tile([0.0, 0, 1], (37, 1)), uv).rotated(FORWARD)
         clock = Item("clock")
         clock.add(rim, self.shop.dark, 0, 0, r)
-        clock.add(face, m.clock_face("clock"), 0, -0.012, r)
+        clock.add(face, prints.clock_face("clock"), 0, -0.012, r)
         return clock
 
     def curtains(self, w: float = 0.5) -> Item:
