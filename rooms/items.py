@@ -1,8 +1,10 @@
 """Items: named groups of meshes, with surfaces for small objects."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from evercal.typing import Array
 from rooms.materials import Material
@@ -10,6 +12,13 @@ from rooms.shapes import Mesh
 
 Parts = list[tuple[Mesh, Material]]
 """Meshes with their materials."""
+
+
+def overlaps(bounds_m: Array, boxes_m: Sequence[Array], gap_m: ArrayLike) -> bool:
+    """Whether a bounding box (2, 3) is within a gap of one of others."""
+    low, high = np.stack(boxes_m, 1)
+    near = (bounds_m[0] < high + gap_m) & (bounds_m[1] > low - gap_m)
+    return bool(near.all(-1).any())
 
 
 @dataclass(eq=False)
