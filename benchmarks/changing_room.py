@@ -101,7 +101,7 @@ def render(rendering: Rendering, out: Path = Path("runs/changing-room")) -> None
                     arm = panda_meshes(shot.joints_rad)
                     if renderer is None:
                         renderer = Renderer(state.meshes() + arm)
-                    renderer.move({mesh.name: mesh for mesh, _ in arm})
+                    renderer.move(arm)
                     origin = np.random.default_rng([seed, number, i])
                     noise = int(origin.integers(2**31))
                     image = renderer.render(

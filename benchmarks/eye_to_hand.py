@@ -35,7 +35,8 @@ from evercal.geometry import SE3, Camera, pose_distance_mm_deg
 from evercal.map import Map
 from evercal.recordings import load_recording
 from evercal.storage import write_json
-from rooms.held import FAULTS, SQUARES, Setting, render, write_poses
+from rooms.held import FAULTS, Setting, render, write_poses
+from rooms.things import SQUARES
 
 FIRST_SEED = 205
 """Seeds below it are for development."""

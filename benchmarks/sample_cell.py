@@ -65,7 +65,7 @@ def render_sample_cell(out: Path) -> None:
     renderer = Renderer(room(*ROOM).meshes() + panda_meshes(wrist_joints[0]))
 
     def take(path: Path, joints: np.ndarray, base_from_camera: SE3) -> None:
-        renderer.move({mesh.name: mesh for mesh, _ in panda_meshes(joints)})
+        renderer.move(panda_meshes(joints))
         seed = int.from_bytes(path.relative_to(out).as_posix().encode()) % 2**31
         write_jpeg(
             path, renderer.render(camera, base_from_camera, options, seed), JPEG_QUALITY

@@ -14,15 +14,14 @@ from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.simulation.panda_arm import joint_frames
 from evercal.typing import Array
+from rooms.items import Parts
 from rooms.materials import Material, plain
 from rooms.shapes import Mesh
 
 _MESHES = "share/example-robot-data/robots/panda_description/meshes/visual"
 
 
-def panda_meshes(
-    joints_rad: Array, opening_m: float = 0.03
-) -> list[tuple[Mesh, Material]]:
+def panda_meshes(joints_rad: Array, opening_m: float = 0.03) -> Parts:
     """Meshes of the arm in the base frame, one named mesh for each colour.
 
     Args:
@@ -43,7 +42,7 @@ def panda_meshes(
     for link, matrices in places.items():
         for matrix in matrices:
             for mesh, material in _link_meshes(link):
-                moved = mesh.rotated(matrix[:3, :3], matrix[:3, 3].tolist())
+                moved = mesh.transformed(matrix)
                 groups.setdefault(material.name, (material, []))[1].append(moved)
     return [(Mesh.merged(group), material) for material, group in groups.values()]
 
@@ -62,7 +61,7 @@ _MATERIALS = {
 
 
 @lru_cache
-def _link_meshes(link: str) -> list[tuple[Mesh, Material]]:
+def _link_meshes(link: str) -> Parts:
     """Meshes of one link in its frame."""
     try:
         import collada  # noqa: F401  # pyright: ignore[reportMissingImports]
@@ -83,7 +82,7 @@ def _link_meshes(link: str) -> list[tuple[Mesh, Material]]:
         faces = np.array(shape.faces)
         uv = np.zeros((len(vertices), 2))
         mesh = Mesh(vertices, faces, normals, uv, f"arm_{tone}")
-        mesh = mesh.rotated(matrix[:3, :3], matrix[:3, 3].tolist())
+        mesh = mesh.transformed(matrix)
         parts.append((mesh, _MATERIALS[tone]))
     return parts
 

@@ -17,6 +17,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.processes import status_of
 from evercal.typing import Array
+from rooms.items import Parts
 from rooms.materials import Material
 from rooms.shapes import Mesh
 
@@ -128,7 +129,7 @@ class Renderer:
     moved. The exposure is a factor on radiance.
     """
 
-    def __init__(self, meshes: list[tuple[Mesh, Material]], exposure: float = 2.0):
+    def __init__(self, meshes: Parts, exposure: float = 2.0):
         mi = self._mi = mitsuba()
         self._exposure = exposure
         self._sensors: dict[Camera, tuple[Any, Any]] = {}
@@ -149,18 +150,16 @@ class Renderer:
         )
         self._parameters = mi.traverse(self._scene)
 
-    def move(self, moved: dict[str, Mesh]) -> None:
+    def move(self, moved: Parts) -> None:
         """Replace vertices and normals of named meshes, in the base frame."""
-        for name, mesh in moved.items():
-            for key, value in (
-                ("positions", mesh.vertices_m),
-                ("normals", mesh.normals),
-            ):
-                old = self._parameters[f"{name}.vertex_{key}"]
-                self._parameters[f"{name}.vertex_{key}"] = type(old)(
-                    np.ascontiguousarray(value, np.float32).ravel()
-                )
+        for mesh, _ in moved:
+            self._replace(f"{mesh.name}.vertex_positions", mesh.vertices_m)
+            self._replace(f"{mesh.name}.vertex_normals", mesh.normals)
         self._parameters.update()
+
+    def _replace(self, key: str, value: Array) -> None:
+        flat = np.ascontiguousarray(value, np.float32).ravel()
+        self._parameters[key] = type(self._parameters[key])(flat)
 
     def render(
         self,

@@ -44,22 +44,24 @@ class Mesh:
             meshes[0].name,
         )
 
-    def placed(self, position_m: Sequence[float], yaw_rad: float = 0.0) -> "Mesh":
+    def placed(self, position_m: ArrayLike, yaw_rad: float = 0.0) -> "Mesh":
         """The mesh rotated about z, then shifted."""
         c = np.cos(yaw_rad)
         s = np.sin(yaw_rad)
         rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return self.rotated(rotation, position_m)
 
-    def rotated(
-        self, rotation: Array, position_m: Sequence[float] = (0, 0, 0)
-    ) -> "Mesh":
+    def rotated(self, rotation: Array, position_m: ArrayLike = (0, 0, 0)) -> "Mesh":
         """The mesh rotated by a (3, 3) matrix, then shifted."""
         return replace(
             self,
             vertices_m=self.vertices_m @ rotation.T + np.asarray(position_m, float),
             normals=self.normals @ rotation.T,
         )
+
+    def transformed(self, matrix: Array) -> "Mesh":
+        """The mesh moved by a rigid transform (4, 4)."""
+        return self.rotated(matrix[:3, :3], matrix[:3, 3])
 
     def shifted(self, x: float, y: float, z: float) -> "Mesh":
         """The mesh shifted by (x, y, z) metres."""
@@ -166,9 +168,7 @@ def box(
     return Mesh.merged(meshes).shifted(0, 0, z / 2)
 
 
-def lathe(
-    profile: Sequence[tuple[float, float]], segments: int = 28, smooth: int = 3
-) -> Mesh:
+def lathe(profile: ArrayLike, segments: int = 28, smooth: int = 3) -> Mesh:
     """A body of revolution about z.
 
     The profile holds (radius, height) pairs in metres, from the bottom of the outside over the rim
@@ -275,9 +275,7 @@ def _normals(points: Array) -> Array:
     return normal * np.where(normal[..., 2:].sum() < 0, -1.0, 1.0)
 
 
-def sheet(
-    corner_m: Sequence[float], u_m: Sequence[float], v_m: Sequence[float]
-) -> Mesh:
+def sheet(corner_m: ArrayLike, u_m: ArrayLike, v_m: ArrayLike) -> Mesh:
     """A flat rectangle with normal u x v and texture coordinates from 0 to 1."""
     corner, u, v = np.array([corner_m, u_m, v_m], float)
     normal = np.tile(_unit(np.cross(u, v)), (4, 1))

@@ -342,7 +342,7 @@ class _Writer:
             )
         elif not np.array_equal(self._joints_rad, shot.joints_rad):
             arm = panda_meshes(shot.joints_rad)
-            self._renderer.move({mesh.name: mesh for mesh, _ in arm})
+            self._renderer.move(arm)
         self._joints_rad = shot.joints_rad
         path = _shutter(shot, following, self.options.blur_steps)
         # Every frame has its own noise pattern.

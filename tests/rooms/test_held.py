@@ -6,7 +6,8 @@ import numpy as np
 
 from evercal.geometry import pose_distance
 from evercal.simulation.panda_arm import base_from_flange
-from rooms.held import SIZES_M, Setting, make_plan
+from rooms.held import Setting, make_plan
+from rooms.things import SIZES_M
 
 SETTING = Setting(seed=100, px=100, images=12)
 

@@ -73,7 +73,7 @@ def test_moved_meshes_change_the_depth() -> None:
     pose = SE3(np.array([1.0, 0, 0, 0]), np.array([0.0, 0.0, -2.0]))
     camera = Camera(48, 48, 60.0, 60.0, 23.5, 23.5)
     before = renderer.depth(camera, pose)[24, 24]
-    renderer.move({"cube": named.shifted(0, 0, 0.5)})
+    renderer.move([(named.shifted(0, 0, 0.5), grey)])
     assert renderer.depth(camera, pose)[24, 24] - before == pytest.approx(0.5, abs=1e-4)
 
 
