@@ -40,11 +40,11 @@ from evercal.storage.manifest import write_manifest
 from .mutations import mutated
 from .recordings.formats import (
     bags_of_messages,
+    test_camera_poses,
     test_colmap,
     test_lerobot,
     test_nerfstudio,
     test_scenes,
-    test_wrist,
 )
 
 if TYPE_CHECKING:
@@ -233,9 +233,9 @@ READERS = {
     "colmap-bin": Reader(colmap("bin"), recording, "sparse/0/*.bin"),
     "colmap-txt": Reader(colmap("txt"), recording, "sparse/0/*.txt"),
     "wrist": Reader(wrist, recording, "wrist/*.*"),
-    "record3d": Reader(folder(test_wrist.record3d), recording, "metadata"),
-    "euroc": Reader(folder(test_wrist.euroc), recording, "mav0/**/*.[cy]*"),
-    "scannet": Reader(folder(test_wrist.scannet), recording, "*/*.txt"),
+    "record3d": Reader(folder(test_camera_poses.record3d), recording, "metadata"),
+    "euroc": Reader(folder(test_camera_poses.euroc), recording, "mav0/**/*.[cy]*"),
+    "scannet": Reader(folder(test_camera_poses.scannet), recording, "*/*.txt"),
     "lerobot-2.1": Reader(lerobot("v2.1"), read_lerobot, "**/*.[jp]*"),
     "lerobot-3.0": Reader(lerobot("v3.0"), read_lerobot, "**/*.[jp]*"),
     "bag-ros1": Reader(bag("ros1"), recording, "*.bag"),

@@ -13,16 +13,8 @@ from evercal.recordings.poses.joint_tables import read_joints
 from evercal.recordings.poses.robot_poses import read_robot_poses
 from evercal.storage.text_files import documents
 
-from .cameras.test_camera_file import (
-    CALIBRATION,
-    EUROC,
-    FIELDS,
-    KALIBR,
-    MESSAGE,
-    ORB_SLAM,
-    VINS,
-    ZIVID,
-)
+from .cameras.test_camera_file import CALIBRATION, FIELDS, MESSAGE
+from .cameras.test_camera_programs import EUROC, KALIBR, ORB_SLAM, VINS, ZIVID
 from .poses.test_pose_data import DATA, STAMPED
 
 CAMERAS = [

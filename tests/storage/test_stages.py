@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import multiprocessing
 import os
 import shutil
@@ -18,71 +17,14 @@ from typing import Any
 import pytest
 
 from evercal.errors import InputError
-from evercal.storage import MANIFEST, Manifest, verify, write_bytes, write_manifest
-from evercal.storage import manifest as module
-from evercal.storage.stages import (
-    SCHEMA,
-    StageStore,
-    is_store,
-    read_store,
-    require_free,
-)
+from evercal.storage import MANIFEST, verify
+from evercal.storage.stages import require_free
 
-Tree = Callable[[Path], dict[str, str]]
+from .stores import FILES, NETWORK, PAYLOAD, Tree, add, change_by, opened, texts
+
 Everything = Callable[[Path], dict[str, "bytes | None"]]
 EveryStep = Callable[[Path, Callable[[], object]], list[Path]]
-PAYLOAD = {"kind": "test"}
-NETWORK = "encoder-1.bin"
-FILES = ("head.bin", "scene.json")
 pytestmark = pytest.mark.usefixtures("quick_disk")
-
-
-def opened(root: Path) -> StageStore[None]:
-    """The store at a path, or a new one."""
-    if not is_store(root):
-        return StageStore(root, None)
-    payload = read_store(root, lambda manifest: manifest.payload)
-    return StageStore(root, None, payload["stages"], payload["networks"])
-
-
-def add(store: StageStore[None], name: str) -> None:
-    def write(folder: Path) -> None:
-        if not store.networks:
-            write_bytes(store.root / NETWORK, b"weights")
-            store.networks = (NETWORK,)
-        write_bytes(folder / "scene.json", json.dumps(name).encode())
-        (folder / "head.bin").write_bytes(bytes(100))
-
-    store.add(name, write, PAYLOAD)
-
-
-def change_by(action: str, store: StageStore[None]) -> None:
-    if action == "replace":
-        store.replace(
-            0, lambda folder: write_bytes(folder / "scene.json", b'"new"'), PAYLOAD
-        )
-    elif action == "remove":
-        store.change(store.stages[1:], [], PAYLOAD)
-    else:
-        add(store, "attic")
-
-
-def texts(root: Path) -> list[str]:
-    """`scene.json` of every stage; none where there is no store."""
-
-    def read(manifest: Manifest) -> list[str]:
-        folders = [root / "stages" / stage for stage in manifest.payload["stages"]]
-        return [json.loads((folder / "scene.json").read_text()) for folder in folders]
-
-    return read_store(root, read) if is_store(root) else []
-
-
-@pytest.fixture
-def root(tmp_path: Path) -> Path:
-    """A store of two stages."""
-    add(opened(tmp_path / "store"), "kitchen")
-    add(opened(tmp_path / "store"), "hall")
-    return tmp_path / "store"
 
 
 def test_stages_are_read_back_in_order(root: Path) -> None:
@@ -322,106 +264,3 @@ def test_racing_processes_lose_no_stage(tmp_path: Path) -> None:
         process.join(60)
         assert process.exitcode == 0
     assert sorted(texts(store)) == [f"{name}-{i}" for name in "abc" for i in range(5)]
-
-
-def test_a_reader_starts_over_if_a_writer_replaces_files(root: Path) -> None:
-    writer = opened(root)
-    attempts = []
-
-    def read(manifest: Manifest) -> str:
-        attempts.append(manifest)
-        if len(attempts) == 1:
-            change_by("replace", writer)
-        stage = manifest.payload["stages"][0]
-        return (root / "stages" / stage / "scene.json").read_text()
-
-    assert read_store(root, read) == '"new"'
-    assert len(attempts) == 2
-
-
-def test_verify_starts_over_if_a_writer_was_faster(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    writer = opened(root)
-    writes = iter("w")
-    read = module.sha256_file
-
-    def interrupted(path: Path) -> str:
-        for _ in writes:
-            change_by("replace", writer)
-        return read(path)
-
-    monkeypatch.setattr(module, "sha256_file", interrupted)
-    assert verify(root) == []
-    assert texts(root) == ["new", "hall"]
-
-
-@pytest.mark.parametrize("file", [NETWORK, "stages/0001-kitchen/head.bin"])
-def test_damaged_files_are_named(root: Path, file: str) -> None:
-    path = root / file
-    store = opened(root)
-    path.write_bytes(path.read_bytes()[:-1] + b"x")
-    damage = f"{path}: checksum does not match, its content was changed"
-    with pytest.raises(InputError, match=f"{damage}; restore it"):
-        texts(root)
-    # The damage is still reported after another stage is added.
-    add(store, "attic")
-    assert verify(root) == [damage]
-    with pytest.raises(InputError, match="checksum"):
-        change_by("replace", store)
-
-
-def test_a_store_whose_file_is_missing_is_not_written(root: Path) -> None:
-    store = opened(root)
-    (root / "stages/0001-kitchen/head.bin").unlink()
-    before = (root / MANIFEST).read_bytes()
-    with pytest.raises((InputError, FileNotFoundError), match=r"head\.bin"):
-        add(store, "attic")
-    assert (root / MANIFEST).read_bytes() == before
-
-
-OUTSIDE = ("../secret.bin", "/etc/hostname", "stages/../../secret.bin", "", 7, None)
-REFUSED: list[tuple[dict[str, object], str]] = [
-    ({"schema": SCHEMA - 1}, "learn the scenes again"),
-    ({"schema": SCHEMA + 1}, "update evercal"),
-    ({"made": "x"}, "'made' in the manifest is not a number"),
-    *(({"networks": [name]}, "network .* is not .*; restore it") for name in OUTSIDE),
-    *(({"stages": [name]}, "stage .* is not .*; restore it") for name in OUTSIDE),
-    *(({"networks": other}, "is not a list") for other in (NETWORK, None, {"a": 1}, 3)),
-    *(({"stages": other}, "is not a list") for other in (NETWORK, None, {"a": 1}, 3)),
-]
-
-
-@pytest.mark.parametrize(("change", "message"), REFUSED)
-def test_a_manifest_of_another_kind_is_refused(
-    root: Path, change: dict[str, object], message: str
-) -> None:
-    (root.parent / "secret.bin").write_text("secret")
-    manifest = Manifest.read(root)
-    write_manifest(root, {**manifest.payload, **change}, list(manifest.files))
-    with pytest.raises(InputError, match=f"store {root}: .*{message}"):
-        texts(root)
-
-
-def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be written"):
-        add(StageStore(tmp_path / "file" / "store", None), "kitchen")
-
-
-@pytest.mark.parametrize("linked", ["stages", "stages/0002-hall"])
-def test_folders_that_are_links_are_never_changed(
-    root: Path, tmp_path: Path, linked: str, tree: Tree
-) -> None:
-    elsewhere = tmp_path / "elsewhere"
-    (root / linked).rename(elsewhere)
-    (root / linked).symlink_to(elsewhere)
-    (elsewhere / "mine.txt").write_text("of another program")
-    journal = '{"new": ["0001-kitchen"], "dropped": ["0002-hall"]}'
-    (root / ".writing").write_text(journal)
-    for _ in range(2):
-        before = tree(tmp_path)
-        with pytest.raises(InputError, match="is a link; copy the whole map instead"):
-            add(opened(root), "attic")
-        assert tree(tmp_path) == before
-        (root / MANIFEST).unlink(missing_ok=True)

@@ -91,6 +91,22 @@ def write_rows(path: Path, episodes: range, images: bool) -> None:
     pq.write_table(pa.table(columns), path, row_group_size=5)
 
 
+def write_episodes(file: Path) -> None:
+    """Where each episode begins in the videos of version 3."""
+    prefix = f"videos/{WRIST}"
+    episodes = [
+        {
+            "episode_index": e,
+            f"{prefix}/chunk_index": 0,
+            f"{prefix}/file_index": e // 2,
+            f"{prefix}/from_timestamp": (e % 2) * LENGTH / FPS,
+        }
+        for e in range(EPISODES)
+    ]
+    file.parent.mkdir(parents=True)
+    pq.write_table(pa.Table.from_pylist(episodes), file)
+
+
 def make(root: Path, version: str, kind: str = "video", codec: str = "libx264") -> Path:
     """A dataset of three episodes of seven frames with two cameras."""
     image = {
@@ -129,19 +145,7 @@ def make(root: Path, version: str, kind: str = "video", codec: str = "libx264") 
             (range(2), "chunk-000", "file-000"),
             (range(2, 3), "chunk-000", "file-001"),
         ]
-        prefix = f"videos/{WRIST}"
-        listed = [
-            {
-                "episode_index": e,
-                f"{prefix}/chunk_index": 0,
-                f"{prefix}/file_index": e // 2,
-                f"{prefix}/from_timestamp": (e % 2) * LENGTH / FPS,
-            }
-            for e in range(EPISODES)
-        ]
-        file = root / "meta/episodes/chunk-000/file-000.parquet"
-        file.parent.mkdir(parents=True)
-        pq.write_table(pa.Table.from_pylist(listed), file)
+        write_episodes(root / "meta/episodes/chunk-000/file-000.parquet")
     for episodes, chunk, name in parts:
         write_rows(root / "data" / chunk / f"{name}.parquet", episodes, kind == "image")
         if kind == "video":
