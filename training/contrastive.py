@@ -34,9 +34,10 @@ from training.pairs import (
     Views,
     cell_pixels,
     homography_pair,
-    leaf_picture,
     photometric,
+    room_seeds,
     room_views,
+    seeded_picture,
     view_pair,
 )
 
@@ -99,10 +100,6 @@ class Batch(NamedTuple):
     """(b, points) bool; pairs may have fewer points."""
 
 
-def _picture(seed: int) -> Array:
-    return leaf_picture(np.random.default_rng([seed, 3]))
-
-
 def make_data(options: PretrainOptions, folder: Path) -> PretrainData:
     """Render rooms and pictures, box rooms with one process per core.
 
@@ -124,14 +121,12 @@ def make_data(options: PretrainOptions, folder: Path) -> PretrainData:
     if options.furnished:
         mitsuba()  # fails early without it
     with started_safely() as context, context.Pool() as pool:
-        seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + options.rooms)
-        rooms = pool.map(room_views, seeds, chunksize=4)
-        seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + options.pictures)
-        pictures = pool.map(_picture, seeds, chunksize=8)
-    seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + options.furnished)
-    return PretrainData(
-        rooms, pictures, [cached_furnished_views(seed, folder) for seed in seeds]
-    )
+        rooms = pool.map(room_views, room_seeds(options.rooms), chunksize=4)
+        seeds = room_seeds(options.pictures)
+        pictures = pool.map(seeded_picture, seeds, chunksize=8)
+    seeds = room_seeds(options.furnished)
+    furnished = [cached_furnished_views(seed, folder) for seed in seeds]
+    return PretrainData(rooms, pictures, furnished)
 
 
 class PairStream(IterableDataset):
@@ -237,13 +232,18 @@ def contrastive_loss(
     return total
 
 
+def _encoded(encoder: torch.nn.Module, images: Tensor) -> Tensor:
+    """Features (2, b, c, h / 8, w / 8) of the images of a batch."""
+    with autocast():
+        return encoder(images.flatten(0, 1)).float().unflatten(0, images.shape[:2])
+
+
 @torch.inference_mode()
 def matching_accuracy(encoder: torch.nn.Module, batches: list[Batch]) -> float:
     """Compute the share (%) of points whose best cell is within 8 pixels of the true match."""
     right = total = 0
     for images, pixels, valid in batches:
-        with autocast():
-            maps = encoder(images.flatten(0, 1)).float().unflatten(0, images.shape[:2])
+        maps = _encoded(encoder, images)
         points = sample_features(maps[0], pixels[0])
         cells = maps[1].flatten(2)
         best = (points @ cells).argmax(-1)
@@ -294,12 +294,11 @@ def train_encoder(
     with started_safely():
         batches = iter(loader)
     for images, pixels, valid in batches:
-        with autocast():
-            maps = encoder(images.flatten(0, 1)).float().unflatten(0, images.shape[:2])
-        points = torch.stack(
-            [sample_features(*of) for of in zip(maps, pixels, strict=True)]
-        )
-        cells = maps.flatten(3).transpose(2, 3) if options.rivals == "cells" else None
+        maps = _encoded(encoder, images)
+        points = torch.stack(list(map(sample_features, maps, pixels)))
+        cells = None
+        if options.rivals == "cells":
+            cells = maps.flatten(3).transpose(2, 3)
         loss = contrastive_loss(points, pixels, valid, options.temperature, cells)
         optimiser.zero_grad()
         loss.backward()
@@ -308,12 +307,7 @@ def train_encoder(
         losses.append(float(loss.detach()))
         step += 1
         if step % CHECKPOINT_STEPS == 0 or step == options.steps:
-            encoder.eval()
-            matched = ", ".join(
-                f"{matching_accuracy(encoder, batches):.1f} % in {kind}"
-                for kind, batches in validation.items()
-            )
-            encoder.train()
+            matched = _validated(encoder, validation)
             seconds = time.perf_counter() - began
             log(
                 f"step {step} loss {np.mean(losses):.3f} matched {matched} {seconds:.0f} s"
@@ -321,6 +315,16 @@ def train_encoder(
             losses.clear()
             _save(folder / CHECKPOINT, trained, step, options)
     return encoder
+
+
+def _validated(encoder: LocalEncoder, validation: dict[str, list[Batch]]) -> str:
+    """Matching accuracy in each kind of held-out rooms."""
+    encoder.eval()
+    matched = []
+    for kind, batches in validation.items():
+        matched.append(f"{matching_accuracy(encoder, batches):.1f} % in {kind}")
+    encoder.train()
+    return ", ".join(matched)
 
 
 def _resume(path: Path, trained: Mapping[str, Any], options: PretrainOptions) -> int:
@@ -365,17 +369,14 @@ def _earlier(checkpoint: Path) -> dict[str, Tensor]:
 def _validation(data: PretrainData, folder: Path) -> dict[str, list[Batch]]:
     """Draw batches from held-out rooms, by kind of room."""
     seeds = range(VALIDATION_ROOM_SEED, VALIDATION_ROOM_SEED + 8)
-    kinds: dict[str, Sequence[Views]] = {
-        "box rooms": [room_views(seed) for seed in seeds]
-    }
+    kinds = {"box rooms": _held_out([room_views(seed) for seed in seeds])}
     if data.furnished:
-        kinds["furnished rooms"] = [
-            cached_furnished_views(seed, folder) for seed in seeds
-        ]
+        views = [cached_furnished_views(seed, folder) for seed in seeds]
+        kinds["furnished rooms"] = _held_out(views)
+    return kinds
+
+
+def _held_out(rooms: Sequence[Views]) -> list[Batch]:
     options = PretrainOptions(room_pairs=8, furnished_pairs=0, leaf_pairs=0)
-    streams = {
-        kind: PairStream(PretrainData(v, []), options, 0) for kind, v in kinds.items()
-    }
-    return {
-        kind: [stream.draw(i) for i in range(6)] for kind, stream in streams.items()
-    }
+    stream = PairStream(PretrainData(rooms, []), options, 0)
+    return [stream.draw(i) for i in range(6)]

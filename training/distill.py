@@ -26,85 +26,80 @@ from evercal.typing import Image
 from training.furnished import cached_furnished_views
 from training.network import SHIPPED, TEACHER, LocalEncoder, from_onnx, onnx_bytes
 from training.pairs import (
-    FIRST_ROOM_SEED,
     HEIGHT,
     WIDTH,
-    leaf_picture,
     photometric,
+    room_seeds,
     room_views,
+    seeded_picture,
 )
 
 CHECKPOINT_STEPS = 250
-TEMPERATURE, COSINE_WEIGHT = 0.05, 4.0
-"""Of the softmax over similarities, and weight of the cosine beside their divergence."""
+"""Optimiser steps between two checkpoints."""
+TEMPERATURE = 0.05
+"""Temperature of the softmax over similarities."""
+COSINE_WEIGHT = 4.0
+"""Weight of the cosine loss beside the divergence of the similarities."""
 COMPARED = 256
 """Cells of an image whose similarities to all others are compared."""
-FURNISHED, BOXES, LEAVES = 4, 2, 2
-"""Images of each kind in a step."""
-
-Images = Image
+COUNTS = (4, 2, 2)
+"""Images of furnished rooms, of box rooms and of dead leaves in a step."""
 
 
 class Pictures(NamedTuple):
     """Grey images by kind, each (n, h, w)."""
 
-    furnished: Images
-    boxes: Images
-    leaves: Images
+    furnished: Image
+    boxes: Image
+    leaves: Image
 
 
 def pictures(rooms: int, boxes: int, leaves: int, folder: Path) -> Pictures:
     """Render furnished rooms (20 views each, cached in `folder`), box rooms and dead leaves."""
-    seeds = range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + max(rooms, boxes, leaves))
-    views = [cached_furnished_views(seed, folder).images for seed in seeds[:rooms]]
-    return Pictures(
-        np.concatenate(views),
-        np.concatenate([room_views(seed).images for seed in seeds[:boxes]]),
-        np.stack(
-            [leaf_picture(np.random.default_rng([seed, 3])) for seed in seeds[:leaves]]
-        ),
-    )
+    views = [cached_furnished_views(seed, folder).images for seed in room_seeds(rooms)]
+    box_views = [room_views(seed).images for seed in room_seeds(boxes)]
+    drawn = [seeded_picture(seed) for seed in room_seeds(leaves)]
+    return Pictures(np.concatenate(views), np.concatenate(box_views), np.stack(drawn))
 
 
-def warped(image: Images, rng: np.random.Generator) -> Images:
+def warped(image: Image, rng: np.random.Generator) -> Image:
     """A random affine view of an image, sometimes mirrored, (HEIGHT, WIDTH)."""
     height, width = image.shape
-    scale = np.exp(rng.uniform(np.log(0.55), np.log(1.25))) * min(
-        height / HEIGHT, width / WIDTH
-    )
+    scale = np.exp(rng.uniform(np.log(0.55), np.log(1.25)))
+    scale *= min(height / HEIGHT, width / WIDTH)
     angle = rng.normal(0, 0.25)
     cosine = scale * np.cos(angle)
     sine = scale * np.sin(angle)
-    matrix = np.array([[cosine, -sine], [sine, cosine]]) * (
-        1 + rng.uniform(-0.12, 0.12, (2, 2))
-    )
-    centre = np.array([width, height]) * (0.5 + rng.uniform(-0.2, 0.2, 2))
+    matrix = np.array([[cosine, -sine], [sine, cosine]])
+    matrix *= 1 + rng.uniform(-0.12, 0.12, (2, 2))
+    centre = (width, height) * (0.5 + rng.uniform(-0.2, 0.2, 2))
     affine = np.c_[matrix, centre - matrix @ [WIDTH / 2, HEIGHT / 2]]
     flags = cv2.INTER_AREA | cv2.WARP_INVERSE_MAP
     view = cv2.warpAffine(
         image, affine, (WIDTH, HEIGHT), flags=flags, borderMode=cv2.BORDER_REFLECT
     )
-    return np.ascontiguousarray(view[:, ::-1] if rng.random() < 0.5 else view, np.uint8)
+    if rng.random() < 0.5:
+        view = view[:, ::-1]
+    return np.ascontiguousarray(view, np.uint8)
 
 
 def batches(data: Pictures, first: int, steps: int) -> Iterator[tuple[Tensor, Tensor]]:
     """Pairs (b, 1, h, w) in [0, 1] of unchanged and changed images, the same for every run."""
     for step in range(first, steps):
         rng = np.random.default_rng([1, step])
-        drawn = [
-            warped(kind[rng.integers(len(kind))], rng)
-            for kind, count in zip(data, (FURNISHED, BOXES, LEAVES), strict=True)
-            for _ in range(count)
-        ]
+        drawn = []
+        for kind, count in zip(data, COUNTS, strict=True):
+            drawn += [warped(rng.choice(kind), rng) for _ in range(count)]
         if rng.random() < 0.3:  # of a camera that is always blurred or dark
             drawn = [photometric(image, rng) for image in drawn]
-        changed = [
-            photometric(image, rng) if rng.random() < 0.6 else image for image in drawn
-        ]
+        changed = list(drawn)
+        for i, image in enumerate(drawn):
+            if rng.random() < 0.6:
+                changed[i] = photometric(image, rng)
         yield _grey(drawn), _grey(changed)
 
 
-def _grey(images: Sequence[Images]) -> Tensor:
+def _grey(images: Sequence[Image]) -> Tensor:
     return torch.from_numpy(np.stack(images))[:, None].float() / 255
 
 
@@ -129,23 +124,25 @@ class Teacher(NamedTuple):
     @torch.no_grad()
     def __call__(self, grey: Tensor) -> Tensor:
         """(b, 1, h, w) -> (b, width, rows, columns) unit vectors."""
-        return F.normalize(
-            torch.einsum("bchw,cd->bdhw", self.module(grey), self.axes), dim=1
-        )
+        features = torch.einsum("bchw,cd->bdhw", self.module(grey), self.axes)
+        return F.normalize(features, dim=1)
 
 
 def difference(student: Tensor, teacher: Tensor, cells: Tensor) -> Tensor:
     """Loss of features (b, d, h, w): of their cosines, and of the similarities of some cells."""
-    own = student.flatten(2)
-    target = teacher.flatten(2)
-    logits = [
-        torch.einsum("bdn,bdm->bnm", x[:, :, cells], target) for x in (own, target)
-    ]
-    found, wanted = (F.log_softmax(x / TEMPERATURE, -1) for x in logits)
-    divergence = (
-        F.kl_div(found, wanted, log_target=True, reduction="none").sum(-1).mean()
-    )
-    return COSINE_WEIGHT * (1 - (own * target).sum(1)).mean() + divergence
+    student = student.flatten(2)
+    teacher = teacher.flatten(2)
+    learned = _similarities(student[..., cells], teacher)
+    expected = _similarities(teacher[..., cells], teacher)
+    divergence = F.kl_div(learned, expected, log_target=True, reduction="none")
+    cosine = (student * teacher).sum(1)
+    return COSINE_WEIGHT * (1 - cosine).mean() + divergence.sum(-1).mean()
+
+
+def _similarities(features: Tensor, teacher: Tensor) -> Tensor:
+    """Logarithm of the softmax over similarities to all cells of the teacher."""
+    logits = torch.einsum("bdn,bdm->bnm", features, teacher)
+    return F.log_softmax(logits / TEMPERATURE, -1)
 
 
 def distil(data: Pictures, steps: int, folder: Path) -> LocalEncoder:
@@ -203,7 +200,7 @@ def run(
     write_bytes(out / "encoder.onnx", onnx_bytes(distil(data, steps, out)))
     encoder = load_encoder(out / "encoder.onnx")
     rows = [encoder(image) for image in (*data.furnished[::5], *data.boxes[::20])]
-    centroids = fit_centroids([each.reshape(-1, encoder.width) for each in rows])
+    centroids = fit_centroids([cells.reshape(-1, encoder.width) for cells in rows])
     save_tensors(out / "vlad.safetensors", {"centroids": centroids.astype(np.float16)})
 
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol
 
+import cv2
 import numpy as np
 from numpy.random import Generator
 
@@ -10,7 +11,7 @@ from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.simulation.box_room import BoxRoom, look_at
 from evercal.simulation.textures import dead_leaves
-from evercal.typing import Array
+from evercal.typing import Array, Image
 
 HEIGHT = 192
 WIDTH = 256
@@ -46,58 +47,58 @@ def cell_pixels() -> Array:
 
 def inside(pixels: Array, margin: float = 3.5) -> Array:
     """Return a mask (n,) of pixels at least `margin` from the border."""
-    u = pixels[:, 0]
-    v = pixels[:, 1]
-    return (
-        (u >= margin)
-        & (u <= WIDTH - 1 - margin)
-        & (v >= margin)
-        & (v <= HEIGHT - 1 - margin)
-    )
+    high = (WIDTH - 1 - margin, HEIGHT - 1 - margin)
+    return ((pixels >= margin) & (pixels <= high)).all(-1)
+
+
+def room_seeds(count: int) -> range:
+    """Seeds of pretraining rooms and pictures."""
+    return range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + count)
 
 
 def random_homography(side: int, rng: Generator) -> Array:
     """Draw a (3, 3) homography from image pixels to pixels of a square picture."""
-    import cv2
-
     scale = np.exp(rng.uniform(np.log(0.6), np.log(1.7)))
     angle = rng.normal(0, 0.3)
     c = np.cos(angle)
     s = np.sin(angle)
-    corners = (
-        np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [WIDTH / 2, HEIGHT / 2] * scale
-    )
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    corners = (2.0 * square - 1) * [WIDTH / 2, HEIGHT / 2] * scale
     corners = corners @ np.array([[c, s], [-s, c]])
     corners *= 1 + rng.uniform(-0.2, 0.2, (4, 2))
     corners += side / 2 + rng.uniform(-0.12, 0.12, 2) * side
-    border = np.array(
-        [[0, 0], [WIDTH - 1, 0], [WIDTH - 1, HEIGHT - 1], [0, HEIGHT - 1]]
-    )
-    return cv2.getPerspectiveTransform(
-        border.astype(np.float32), corners.astype(np.float32)
-    )
+    border = square * np.float32([WIDTH - 1, HEIGHT - 1])
+    return cv2.getPerspectiveTransform(border, corners.astype(np.float32))
 
 
 def homography_pair(picture: Array, rng: Generator) -> Pair:
     """Warp one grey (s, s) uint8 picture to two random perspective views."""
-    import cv2
-
-    maps = [random_homography(picture.shape[0], rng) for _ in range(2)]
-    flags = cv2.INTER_AREA | cv2.WARP_INVERSE_MAP
-    images = [
-        cv2.warpPerspective(
-            picture, m, (WIDTH, HEIGHT), flags=flags, borderMode=cv2.BORDER_REFLECT
+    maps = []
+    images = []
+    for _ in range(2):
+        homography = random_homography(len(picture), rng)
+        maps.append(homography)
+        warped = cv2.warpPerspective(
+            picture,
+            homography,
+            (WIDTH, HEIGHT),
+            flags=cv2.INTER_AREA | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REFLECT,
         )
-        for m in maps
-    ]
-    first = cell_pixels() + rng.uniform(-3.5, 3.5, (HEIGHT * WIDTH // 64, 2))
+        images.append(warped)
+    first = _random_pixels(rng)
     second = cv2.perspectiveTransform(first[None], np.linalg.inv(maps[1]) @ maps[0])[0]
     on_picture = cv2.perspectiveTransform(first[None], maps[0])[0]
     keep = inside(first) & inside(second)
-    keep &= ((on_picture >= 0) & (on_picture < picture.shape[0])).all(-1)
-    return Pair(
-        np.stack(images), np.stack([first[keep], second[keep]]).astype(np.float32)
-    )
+    keep &= ((on_picture >= 0) & (on_picture < len(picture))).all(-1)
+    pixels = np.stack([first[keep], second[keep]])
+    return Pair(np.stack(images), pixels.astype(np.float32))
+
+
+def _random_pixels(rng: Generator) -> Array:
+    """One random pixel (u, v) of each cell, in the order of `cell_pixels`."""
+    centres = cell_pixels()
+    return centres + rng.uniform(-3.5, 3.5, centres.shape)
 
 
 class Views(Protocol):
@@ -144,8 +145,6 @@ class RoomViews:
 
 def room_views(seed: int, anchors: int = 5, per_anchor: int = PER_ANCHOR) -> RoomViews:
     """Render a room from `anchors * per_anchor` cameras with different parallax, scale, roll."""
-    import cv2
-
     rng = np.random.default_rng([seed, 77])
     room = BoxRoom(seed, texture_px=256)
     poses = []
@@ -176,7 +175,7 @@ def room_views(seed: int, anchors: int = 5, per_anchor: int = PER_ANCHOR) -> Roo
 
 def view_pair(views: Views, first: int, second: int, rng: Generator) -> Pair:
     """Compute corresponding pixels of two views of a room, without occluded points."""
-    pixels = cell_pixels() + rng.uniform(-3.5, 3.5, (HEIGHT * WIDTH // 64, 2))
+    pixels = _random_pixels(rng)
     points = views.hit(first, pixels)
     in_b = views.base_from_camera[second].inverse().apply(points)
     front = np.isfinite(in_b[:, 2]) & (in_b[:, 2] > 0.05)
@@ -190,8 +189,6 @@ def view_pair(views: Views, first: int, second: int, rng: Generator) -> Pair:
 
 def photometric(image: Array, rng: Generator) -> Array:
     """Change exposure, contrast, gamma, shading, blur and noise at random; uint8."""
-    import cv2
-
     x = image.astype(np.float32) / 255.0
     if rng.random() < 0.35:
         sigma = rng.uniform(0.4, 1.4)
@@ -216,8 +213,11 @@ def photometric(image: Array, rng: Generator) -> Array:
     return (np.clip(x, 0, 1) * 255).astype(np.uint8)
 
 
+def seeded_picture(seed: int) -> Image:
+    """Draw the dead-leaves picture of a seed."""
+    return leaf_picture(np.random.default_rng([seed, 3]))
+
+
 def leaf_picture(rng: Generator, side: int = 448) -> Array:
     """Draw a grey (side, side) uint8 dead-leaves picture."""
-    import cv2
-
     return cv2.cvtColor(dead_leaves(side, side, rng), cv2.COLOR_RGB2GRAY)
