@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.random import Generator
 
-from rooms.items import Item
+from rooms.items import Item, overlaps
 from rooms.materials import Material
 from rooms.room import Room
 
@@ -42,20 +42,27 @@ def changed_room(before: Room, seed: int) -> Room:
 def rearranged(before: Room, seed: int) -> Room:
     """Move or remove a share of the small objects."""
     rng = np.random.default_rng([seed, 12, before.seed])
-    return replace(before, items=_rearranged(before, rng))
+    small = [i for i, item in enumerate(before.items) if item.kind in SMALL]
+    touched = rng.choice(small, round(CHANGED_SHARE * len(small)), replace=False)
+    remaining: dict[int, Item | None] = dict(enumerate(before.items))
+    for number, i in enumerate(touched.tolist()):
+        item = before.items[i]
+        remaining[i] = None
+        if number % 2 == 0:
+            rest = list(filter(None, remaining.values()))
+            remaining[i] = moved_item(item, before, rest, rng)
+    return replace(before, items=list(filter(None, remaining.values())))
 
 
 def relit(before: Room, seed: int) -> Room:
     """Switch and dim lamps."""
     items = list(before.items)
-    lamps = [
-        i
-        for i, item in enumerate(items)
-        if any(mat.emission > 0 for _, mat in item.parts)
-    ]
-    ceiling, *factors = _factors(
-        1 + len(lamps), np.random.default_rng([seed, 13, before.seed])
-    )
+    lamps = []
+    for i, item in enumerate(items):
+        if any(material.emission > 0 for _, material in item.parts):
+            lamps.append(i)
+    rng = np.random.default_rng([seed, 13, before.seed])
+    ceiling, *factors = _factors(1 + len(lamps), rng)
     for factor, i in zip(factors, lamps, strict=True):
         parts = [(mesh, _dimmed(material, factor)) for mesh, material in items[i].parts]
         items[i] = replace(items[i], parts=parts)
@@ -85,25 +92,11 @@ def _dimmed(material: Material, factor: float) -> Material:
     return replace(material, name=name, emission=factor * material.emission)
 
 
-def _rearranged(before: Room, rng: Generator) -> list[Item]:
-    """The items after a share of the small ones moved or were removed."""
-    small = [i for i, item in enumerate(before.items) if item.kind in SMALL]
-    touched = rng.choice(small, round(CHANGED_SHARE * len(small)), replace=False)
-    remaining: dict[int, Item] = dict(enumerate(before.items))
-    for number, i in enumerate(touched.tolist()):
-        item = remaining.pop(i)
-        rest = list(remaining.values())
-        moved = moved_item(item, before, rest, rng) if number % 2 == 0 else None
-        if moved is not None:
-            remaining[i] = moved
-    return [remaining[i] for i in sorted(remaining)]
-
-
 def moved_item(item: Item, room: Room, rest: list[Item], rng: Generator) -> Item | None:
     """The item at a free position on the floor or on furniture; None after 60 failed attempts."""
     low, high = item.bounds_m()
     middle = (low + high)[:2] / 2
-    at_origin = item.placed(-float(middle[0]), -float(middle[1]), -float(low[2]))
+    at_origin = item.placed(*-middle, -low[2])
     on_floor = low[2] < room.low_m[2] + 0.01
     tops = [(other, top) for other in rest for top in other.tops]
     area = np.array([(x1 - x0) * (y1 - y0) for _, (x0, x1, y0, y1, _) in tops])
@@ -111,8 +104,7 @@ def moved_item(item: Item, room: Room, rest: list[Item], rng: Generator) -> Item
         host = None
         z = float(room.low_m[2])
         if on_floor:
-            inner = room.low_m[:2] + 0.25, room.high_m[:2] - 0.25
-            spot = rng.uniform(*inner)
+            spot = rng.uniform(room.low_m[:2] + 0.25, room.high_m[:2] - 0.25)
             # Along the walls, as in furnishing: people walk in the middle of the room.
             if np.minimum(spot - room.low_m[:2], room.high_m[:2] - spot).min() >= 0.9:
                 continue
@@ -121,7 +113,7 @@ def moved_item(item: Item, room: Room, rest: list[Item], rng: Generator) -> Item
             spot = rng.uniform((x0, y0), (x1, y1))
             z += 0.001
         yaw = rng.uniform(0, 2 * np.pi)
-        moved = at_origin.placed(float(spot[0]), float(spot[1]), z, yaw)
+        moved = at_origin.placed(*spot, z, yaw)
         blocks_work = host is rest[0] and np.hypot(*(spot - _WORK_M)) < 0.16
         far = np.hypot(*(spot - middle)) >= MOVED_M
         if far and not blocks_work and _fits(moved, room, rest, host):
@@ -131,14 +123,11 @@ def moved_item(item: Item, room: Room, rest: list[Item], rng: Generator) -> Item
 
 def _fits(item: Item, room: Room, rest: list[Item], host: Item | None) -> bool:
     """Whether the item is inside the room and overlaps no other item and no part of its host."""
-    bounds = item.bounds_m()
-    if (bounds[0, :2] < room.low_m[:2]).any() or (
-        bounds[1, :2] > room.high_m[:2]
-    ).any():
+    low, high = bounds = item.bounds_m()
+    if (low[:2] < room.low_m[:2]).any() or (high[:2] > room.high_m[:2]).any():
         return False
-    boxes = [_FOOT_M, *(other.bounds_m() for other in rest if other is not host)]
+    others = [other for other in rest if other is not host]
     if host is not None:
-        boxes += [Item("part", [part]).bounds_m() for part in host.parts]
-    low, high = np.stack(boxes).swapaxes(0, 1)
-    hit = (bounds[0] < high + _GAP_M) & (bounds[1] > low - _GAP_M)
-    return not hit.all(-1).any()
+        others += [Item("part", [part]) for part in host.parts]
+    boxes = [_FOOT_M, *(other.bounds_m() for other in others)]
+    return not overlaps(bounds, boxes, _GAP_M)

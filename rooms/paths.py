@@ -5,6 +5,7 @@ poses close to a training pose are removed, and the sweep is sampled more densel
 poses remain.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -16,6 +17,7 @@ from evercal.simulation.box_room import look_at
 from evercal.simulation.panda_arm import HOME_RAD
 from evercal.typing import Array
 from rooms.room import Room
+from rooms.shapes import positions
 
 WORK_AREA_M = np.array([0.45, 0.0, 0.15])
 """Centre of the work area that cameras look at, base frame."""
@@ -52,13 +54,16 @@ def sweep_shots(room: Room, frames: int, seed: int) -> list[Shot]:
     test = _far_from(room, frames - train_count, train, [seed, 9])
     arm_train = _arm_path(train_count, [seed, 2], hold=12)
     arm_test = _arm_path(frames - train_count, [seed, 3], hold=12)
-    shots = [
-        Shot(f"train-{i:06d}", "train", train[i], arm_train[i])
-        for i in range(train_count)
+    return _shots("train", train, arm_train) + _shots("test", test, arm_test)
+
+
+def _shots(name: str, poses: Iterable[SE3], joints_rad: Array) -> list[Shot]:
+    """Numbered training frames, called train, or test frames of another name."""
+    split = "train" if name == "train" else "test"
+    return [
+        Shot(f"{name}-{i:06d}", split, pose, joints)
+        for i, (pose, joints) in enumerate(zip(poses, joints_rad, strict=True))
     ]
-    for i in range(frames - train_count):
-        shots.append(Shot(f"test-{i:06d}", "test", test[i], arm_test[i]))
-    return shots
 
 
 def changed_shots(room: Room, frames: int, train: SE3, seed: int) -> list[Shot]:
@@ -71,7 +76,7 @@ def changed_shots(room: Room, frames: int, train: SE3, seed: int) -> list[Shot]:
     """
     path = _far_from(room, frames, train, [seed, 10])
     arm = _arm_path(frames, [seed, 11], hold=12)
-    return [Shot(f"changed-{i:06d}", "test", path[i], arm[i]) for i in range(frames)]
+    return _shots("changed", path, arm)
 
 
 class FixedShots(NamedTuple):
@@ -94,18 +99,15 @@ def fixed_shots(room: Room, frames: int, seed: int) -> FixedShots:
     pose = _free_path(room, 200, [seed, 5])[int(rng.integers(200))]
     direction = rng.standard_normal(3)
     direction /= np.linalg.norm(direction)
-    still = np.zeros(3)
-    moves = seed % 2 == 0
-    parts = (
-        (0.005 * direction, still) if moves else (still, np.deg2rad(0.5) * direction)
-    )
-    bump = SE3.exp(np.concatenate(parts))
+    tangent = np.zeros(6)
+    if seed % 2 == 0:
+        tangent[:3] = 0.005 * direction
+    else:
+        tangent[3:] = np.deg2rad(0.5) * direction
+    bump = SE3.exp(tangent)
     arms = _arm_path(2 * frames, [seed, 6], hold=1, cycles=3.0)
-    before = [Shot(f"fixed-{i:06d}", "test", pose, arms[i]) for i in range(frames)]
-    moved = pose @ bump
-    after = [
-        Shot(f"bumped-{i:06d}", "test", moved, arms[frames + i]) for i in range(frames)
-    ]
+    before = _shots("fixed", [pose] * frames, arms[:frames])
+    after = _shots("bumped", [pose @ bump] * frames, arms[frames:])
     return FixedShots(before, after, bump)
 
 
@@ -113,9 +115,7 @@ def hand_camera(seed: int) -> SE3:
     """gripper_from_camera: 8 cm beside the flange, along the fingers, slightly tilted."""
     rng = np.random.default_rng([seed, 7])
     tangent = np.concatenate([rng.uniform(-0.01, 0.01, 3), rng.uniform(-0.12, 0.12, 3)])
-    return SE3(np.array([1.0, 0, 0, 0]), np.array([0.085, 0.0, 0.02])) @ SE3.exp(
-        tangent
-    )
+    return SE3.from_translation((0.085, 0.0, 0.02)) @ SE3.exp(tangent)
 
 
 def hand_joints(frames: int, seed: int) -> Array:
@@ -181,16 +181,17 @@ def _sweep(frames: int, rng: np.random.Generator) -> SE3:
     azimuth = wave(-1.9, 1.9, 1.0)
     distance = wave(0.85, 1.9, 1.63)
     elevation = wave(0.28, 0.95, 0.71)
-    gaze = [wave(-0.45, 0.15, 0.9), wave(-0.35, 0.35, 1.2), wave(-0.1, 0.3, 1.4)]
-    target = WORK_AREA_M + np.stack(gaze, -1)
-    roll = wave(-0.12, 0.12, 0.8)
-    x = np.cos(azimuth) * np.cos(elevation)
-    y = np.sin(azimuth) * np.cos(elevation)
-    direction = np.stack([x, y, np.sin(elevation)], -1)
-    position = WORK_AREA_M + distance[:, None] * direction
-    return SE3.stack(
-        [look_at(*view) for view in zip(position, target, roll, strict=True)]
+    gaze = positions(
+        wave(-0.45, 0.15, 0.9), wave(-0.35, 0.35, 1.2), wave(-0.1, 0.3, 1.4)
     )
+    target = WORK_AREA_M + gaze
+    roll = wave(-0.12, 0.12, 0.8)
+    flat = np.cos(elevation)
+    direction = positions(
+        np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)
+    )
+    position = WORK_AREA_M + distance[:, None] * direction
+    return SE3.stack(list(map(look_at, position, target, roll)))
 
 
 def _far_from(room: Room, frames: int, train: SE3, seed: list[int]) -> SE3:

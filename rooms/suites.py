@@ -10,8 +10,8 @@ missing frame. Rooms have fixed seeds; the option `seed` varies the paths.
 """
 
 import shutil
-from collections.abc import Generator, Iterator
-from dataclasses import asdict, dataclass, field
+from collections.abc import Generator, Iterable, Iterator
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,9 +36,12 @@ from rooms.paths import (
     sweep_shots,
 )
 from rooms.renderer import Renderer, RenderOptions, choose_variant, mitsuba
-from rooms.room import RESERVED, Room, room
+from rooms.room import KINDS, REPEATED, RESERVED, Room, room
 
 CALIBRATION_FRAMES = 25
+"""Frames of each calibration recording."""
+Recordings = list[tuple[Path, list[Shot]]]
+"""Folders of recordings, with their frames."""
 
 
 @dataclass(frozen=True)
@@ -61,50 +64,33 @@ class Suite:
     """Test frames per room after small objects moved and lamps switched; see `changed_room`."""
 
 
-_CYCLE = ("bedroom", "kitchen", "living")
+def _rooms(kinds: Iterable[str], first_seed: int) -> tuple[tuple[str, str, int], ...]:
+    """One room of each kind, with successive seeds."""
+    return tuple((kind, kind, seed) for seed, kind in enumerate(kinds, first_seed))
 
 
 def _numbered(count: int, first_seed: int) -> tuple[tuple[str, str, int], ...]:
-    kinds = [_CYCLE[i % 3] for i in range(count)]
+    """Rooms bedroom-1, kitchen-1, living-1, bedroom-2, ..."""
+    kinds = tuple(KINDS)
     return tuple(
-        (f"{kind}-{i // 3 + 1}", kind, first_seed + i) for i, kind in enumerate(kinds)
+        (f"{kinds[i % 3]}-{i // 3 + 1}", kinds[i % 3], first_seed + i)
+        for i in range(count)
     )
 
 
-_THREE = (
-    ("bedroom", "bedroom", 101),
-    ("kitchen", "kitchen", 102),
-    ("living", "living", 103),
-)
-_REPEATED = (
-    ("workshop", "workshop", 401),
-    ("canteen", "canteen", 402),
-    ("hall", "hall", 403),
-)
+_THREE = _rooms(KINDS, 101)
+_SMALL = Suite(_THREE, 130, (320, 240), 16, depth=False, jpeg_quality=85)
 
 # Rooms of no published table: settings of the networks are chosen on `sim-tune`, and confirmed on
 # `sim-unseen`.
-_TUNE = (
-    ("bedroom", "bedroom", 4001),
-    ("kitchen", "kitchen", 4002),
-    ("living", "living", 4003),
-)
-_UNSEEN = (
-    ("bedroom", "bedroom", 5001),
-    ("kitchen", "kitchen", 5002),
-    ("living", "living", 5003),
-)
-
 SUITES: dict[str, Suite] = {
     "sim": Suite(_THREE, 3300, (640, 480), 16),
     "sim-7": Suite(_numbered(7, 201), 1000, (320, 240), 16),
     "sim-12": Suite(_numbered(12, 301), 1000, (320, 240), 16),
-    "sim-mini": Suite(
-        _THREE, 130, (320, 240), 16, depth=False, jpeg_quality=85, changed=20
-    ),
-    "sim-tune": Suite(_TUNE, 130, (320, 240), 16, depth=False, jpeg_quality=85),
-    "sim-unseen": Suite(_UNSEEN, 1000, (320, 240), 16, depth=False, jpeg_quality=85),
-    "sim-repeat": Suite(_REPEATED, 130, (320, 240), 16, depth=False, jpeg_quality=85),
+    "sim-mini": replace(_SMALL, changed=20),
+    "sim-tune": replace(_SMALL, rooms=_rooms(KINDS, 4001)),
+    "sim-unseen": replace(_SMALL, rooms=_rooms(KINDS, 5001), frames=1000),
+    "sim-repeat": replace(_SMALL, rooms=_rooms(REPEATED, 401)),
 }
 
 
@@ -162,7 +148,7 @@ def simulate(
     others = 0 if options.sweep_only else 3 * CALIBRATION_FRAMES + suite.changed
     total = (frames + others) * len(suite.rooms)
     render = RenderOptions(
-        samples=suite.samples if options.samples is None else options.samples,
+        samples=options.samples or suite.samples,
         exposure_ev=options.exposure_ev,
         noise=options.noise,
         blur_steps=options.blur_steps,
@@ -175,12 +161,11 @@ def simulate(
         "jpeg_quality": suite.jpeg_quality,
         **asdict(render),
     }
-    existing = sum(
-        1 for scene, *_ in suite.rooms for _ in (out / scene).glob("**/images/*.jpg")
-    )
-    _refuse_full_disk(
-        out, (total - existing) * width * height * (4 if suite.depth else 2)
-    )
+    missing = total
+    for scene, *_ in suite.rooms:
+        missing -= len(list((out / scene).glob("**/images/*.jpg")))
+    pixel_bytes = 4 if suite.depth else 2
+    _refuse_full_disk(out, missing * width * height * pixel_bytes)
     mi = mitsuba()
     settings["renderer"] = f"mitsuba {mi.__version__} {mi.variant()}"
     lock_settings(out / "render.json", settings)
@@ -188,27 +173,32 @@ def simulate(
     done = 0
     for scene, kind, room_seed in suite.rooms:
         before = room(kind, room_seed)
-        sweep = sweep_shots(before, frames, options.seed)
-        recordings = [(out / scene, sweep)]
-        if not options.sweep_only:
-            recordings += _calibrations(
-                before, options.seed, out / scene / "calibration"
-            )
-        plans = [(before, recordings)]
-        if suite.changed and not options.sweep_only:
-            after = changed_room(before, options.seed)
-            train = SE3.stack(
-                [shot.base_from_camera for shot in sweep if shot.split == "train"]
-            )
-            shots = changed_shots(after, suite.changed, train, options.seed)
-            plans.append((after, [(out / scene / "changed", shots)]))
-        for state, recordings in plans:
+        for state, recordings in _plans(before, out / scene, suite, options):
             camera = default_camera(width, height)
             writer = _Writer(state, camera, suite, options.seed, render, settings)
             for root, shots in recordings:
                 for _ in writer.record(root, scene, shots):
                     done += 1
                     yield Progress(done, total, root, renderer)
+
+
+def _plans(
+    before: Room, folder: Path, suite: Suite, options: SimulateOptions
+) -> list[tuple[Room, Recordings]]:
+    """Plan the recordings of a room, and of the room after a change."""
+    seed = options.seed
+    sweep = sweep_shots(before, options.frames or suite.frames, seed)
+    recordings = [(folder, sweep)]
+    plans = [(before, recordings)]
+    if options.sweep_only:
+        return plans
+    recordings += _calibrations(before, seed, folder / "calibration")
+    if suite.changed:
+        after = changed_room(before, seed)
+        train = [shot.base_from_camera for shot in sweep if shot.split == "train"]
+        shots = changed_shots(after, suite.changed, SE3.stack(train), seed)
+        plans.append((after, [(folder / "changed", shots)]))
+    return plans
 
 
 def _checked(name: str, options: SimulateOptions) -> Suite:
@@ -248,9 +238,7 @@ def _refuse_full_disk(out: Path, needed: int) -> None:
         )
 
 
-def _calibrations(
-    before: Room, seed: int, folder: Path
-) -> list[tuple[Path, list[Shot]]]:
+def _calibrations(before: Room, seed: int, folder: Path) -> Recordings:
     """Plan the calibration recordings of a room and write the true calibration."""
     fixed, bumped, bump = fixed_shots(before, CALIBRATION_FRAMES, seed)
     gripper_from_camera = hand_camera(seed)
