@@ -77,20 +77,19 @@ def test_moved_items_stand_on_a_surface_without_overlap(
     before: Room, after: Room
 ) -> None:
     old = items_by_position(before, small=True)
-    moved = [
-        item
-        for key, item in items_by_position(after, small=True).items()
-        if key not in old
-    ]
+    new = items_by_position(after, small=True)
+    moved = [new[key] for key in new.keys() - old.keys()]
     heights = [before.low_m[2], *(top[4] for item in after.items for top in item.tops)]
     for item in moved:
         low, high = item.bounds_m()
         assert np.abs(np.array(heights) - low[2]).min() < 0.002
-        others = [
-            other for other in after.items if other is not item and not other.tops
+        boxes = [
+            other.bounds_m()
+            for other in after.items
+            if other is not item and not other.tops
         ]
-        boxes = np.stack([other.bounds_m() for other in others])
-        assert not ((low < boxes[:, 1]) & (high > boxes[:, 0])).all(-1).any(), item.kind
+        lows, highs = np.stack(boxes, 1)
+        assert not ((low < highs) & (high > lows)).all(-1).any(), item.kind
 
 
 def test_other_lamps_are_on(before: Room, after: Room) -> None:
@@ -106,18 +105,14 @@ def test_other_lamps_are_on(before: Room, after: Room) -> None:
 
 
 def test_the_same_seed_gives_the_same_change(before: Room, after: Room) -> None:
-    a = after
-    b = changed_room(before, 0)
-    c = changed_room(before, 4)
-    assert (
-        items_by_position(a, small=True).keys()
-        == items_by_position(b, small=True).keys()
+    again = changed_room(before, 0)
+    other = changed_room(before, 4)
+    assert lights(after) == lights(again)
+    keys, same, others = (
+        items_by_position(rooms, small=True).keys() for rooms in (after, again, other)
     )
-    assert lights(a) == lights(b)
-    assert (
-        items_by_position(a, small=True).keys()
-        != items_by_position(c, small=True).keys()
-    )
+    assert keys == same
+    assert keys != others
 
 
 def test_the_changed_path_is_new_and_free(before: Room, after: Room) -> None:

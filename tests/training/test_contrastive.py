@@ -114,10 +114,8 @@ class Oracle(nn.Module):
 
     def forward(self, grey: Tensor) -> Tensor:
         maps = unit(HEIGHT // 8, WIDTH // 8, 64).permute(2, 0, 1)
-        first = maps
-        second = maps.roll(self.columns, -1)
         half = len(grey) // 2
-        return torch.stack([first] * half + [second] * half)
+        return torch.stack([maps] * half + [maps.roll(self.columns, -1)] * half)
 
 
 @pytest.mark.parametrize("columns", [0, 2, -3])
@@ -126,29 +124,22 @@ def test_matching_accuracy_of_an_oracle(
 ) -> None:
     rng = np.random.default_rng(0)
     inner = cell_pixels().reshape(HEIGHT // 8, WIDTH // 8, 2)[2:-2, 4:-4].reshape(-1, 2)
-    pixels = (
-        torch.from_numpy(inner[rng.permutation(len(inner))[:100]])
-        .float()
-        .expand(3, -1, -1)
-    )
+    pixels = torch.from_numpy(rng.permutation(inner)[:100]).float().expand(3, -1, -1)
     there = pixels + torch.tensor([8.0 * columns, 0.0])
     images = torch.zeros(2, 3, 1, HEIGHT, WIDTH)
     valid = torch.ones(3, 100, dtype=torch.bool)
     oracle = Oracle(columns)
 
-    def evaluate(moved: float, valid: Tensor = valid) -> float:
-        truth = there + torch.tensor([0.0, moved])
-        return matching_accuracy(
-            oracle, [Batch(images, torch.stack([pixels, truth]), valid)]
-        )
+    def evaluate(truth: Tensor, valid: Tensor = valid) -> float:
+        batch = Batch(images, torch.stack([pixels, truth]), valid)
+        return matching_accuracy(oracle, [batch])
 
-    assert evaluate(0.0) == evaluate(7.5) == 100.0
-    assert evaluate(8.5) == evaluate(-40.0) == 0.0
+    for down, accuracy in ((0.0, 100.0), (7.5, 100.0), (8.5, 0.0), (-40.0, 0.0)):
+        assert evaluate(there + torch.tensor([0.0, down])) == accuracy
     half = torch.arange(100).expand(3, -1) < 50
     mixed = torch.where(half[..., None], there, there + 40)
-    batch = Batch(images, torch.stack([pixels, mixed]), valid)
-    assert matching_accuracy(oracle, [batch]) == 50.0
-    assert matching_accuracy(oracle, [batch._replace(valid=half)]) == 100.0
+    assert evaluate(mixed) == 50.0
+    assert evaluate(mixed, half) == 100.0
 
 
 def test_batches_depend_on_seed_and_step_only(data: PretrainData) -> None:
@@ -163,10 +154,7 @@ def test_batches_depend_on_seed_and_step_only(data: PretrainData) -> None:
     assert (pixels[:, valid] >= 3.5 - 1e-4).all()
     assert (pixels[..., ~valid, :] == 0).all()
     for other in (stream.draw(4), next(iter(PairStream(data, OPTIONS, 4)))):
-        assert all(
-            torch.equal(a, b)
-            for a, b in zip(other, (images, pixels, valid), strict=True)
-        )
+        assert all(map(torch.equal, other, (images, pixels, valid)))
     assert not torch.equal(stream.draw(5)[0], images)
     assert not torch.equal(
         PairStream(data, replace(OPTIONS, seed=2), 0).draw(4)[0], images
@@ -198,13 +186,22 @@ class StopError(Exception):
     pass
 
 
+def trained(
+    data: PretrainData, options: PretrainOptions, folder: Path
+) -> tuple[dict[str, Tensor], list[str]]:
+    """Train the encoder; its weights and the lines of the log."""
+    folder.mkdir(exist_ok=True)
+    lines: list[str] = []
+    encoder = train_encoder(data, options, folder, lines.append)
+    return encoder.state_dict(), lines
+
+
 @pytest.mark.usefixtures("small")
 def test_resumed_training_equals_uninterrupted_training(
     data: PretrainData, tmp_path: Path
 ) -> None:
-    for folder in "ab":
-        (tmp_path / folder).mkdir()
-    whole = train_encoder(data, OPTIONS, tmp_path / "a", lambda line: None).state_dict()
+    (tmp_path / "b").mkdir()
+    whole, _ = trained(data, OPTIONS, tmp_path / "a")
 
     def stop(line: str) -> None:
         if line.startswith("step 4"):
@@ -212,28 +209,23 @@ def test_resumed_training_equals_uninterrupted_training(
 
     with pytest.raises(StopError):
         train_encoder(data, OPTIONS, tmp_path / "b", stop)
-    lines: list[str] = []
-    again = train_encoder(data, OPTIONS, tmp_path / "b", lines.append).state_dict()
+    again, lines = trained(data, OPTIONS, tmp_path / "b")
     assert lines[0] == "resumed at step 2"
     assert [line.split()[1] for line in lines[1:]] == ["4", "6"]
+    # A finished run does no further steps.
+    third, lines = trained(data, OPTIONS, tmp_path / "b")
+    assert lines == ["resumed at step 6"]
     for name, value in whole.items():
         assert torch.equal(value, again[name]), name
-    # A finished run does no further steps.
-    lines.clear()
-    third = train_encoder(data, OPTIONS, tmp_path / "b", lines.append).state_dict()
-    assert lines == ["resumed at step 6"]
-    assert all(torch.equal(value, third[name]) for name, value in whole.items())
+        assert torch.equal(value, third[name]), name
     # A checkpoint with other options is ignored.
-    lines.clear()
-    train_encoder(data, replace(OPTIONS, seed=7, steps=2), tmp_path / "b", lines.append)
+    _, lines = trained(data, replace(OPTIONS, seed=7, steps=2), tmp_path / "b")
     assert not any("resumed" in line for line in lines)
 
 
 @pytest.mark.usefixtures("small")
 def test_training_lowers_the_loss(data: PretrainData, tmp_path: Path) -> None:
-    lines: list[str] = []
-    options = replace(OPTIONS, steps=24, peak_rate=1e-2)
-    train_encoder(data, options, tmp_path, lines.append)
+    _, lines = trained(data, replace(OPTIONS, steps=24, peak_rate=1e-2), tmp_path)
     losses = [float(line.split()[3]) for line in lines]
     assert np.mean(losses[-3:]) < 0.93 * np.mean(losses[:2])
     assert losses[0] < math.log(3 * 64 + len(cell_pixels())) + 1
@@ -244,17 +236,13 @@ def test_training_starts_from_an_earlier_run(
     data: PretrainData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(contrastive, "DataLoader", DataLoader)  # with a worker process
-    lines: list[str] = []
     first = tmp_path / "first"
-    second = tmp_path / "second"
-    for folder in (first, second):
-        folder.mkdir()
-    before = train_encoder(data, replace(OPTIONS, steps=2), first, lines.append)
+    before, _ = trained(data, replace(OPTIONS, steps=2), first)
     start = replace(OPTIONS, steps=1, peak_rate=1e-9, init=str(first / "encoder.pt"))
-    after = train_encoder(data, start, second, lines.append)
+    after = train_encoder(data, start, tmp_path, print)
     for name, value in after.named_parameters():
-        torch.testing.assert_close(value, before.state_dict()[name], atol=1e-6, rtol=0)
+        torch.testing.assert_close(value, before[name], atol=1e-6, rtol=0)
     (tmp_path / "nonsense.pt").write_bytes(b"nonsense")
-    for bad in (tmp_path / "nonsense.pt", tmp_path / "none.pt"):
+    for bad in ("nonsense.pt", "none.pt"):
         with pytest.raises(InputError, match=r"not the encoder\.pt of a run"):
-            train_encoder(data, replace(start, init=str(bad)), tmp_path, lines.append)
+            trained(data, replace(start, init=str(tmp_path / bad)), tmp_path)
