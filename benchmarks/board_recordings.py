@@ -88,7 +88,7 @@ def project(points: Array, camera_from_board: SE3, camera: Camera) -> Array:
     shift = camera_from_board.translation_m
     distortion = np.array(camera.distortion)
     pixels, _ = cv2.projectPoints(points, rotvec, shift, camera.matrix(), distortion)
-    return pixels.reshape(-1, 2)
+    return np.asarray(pixels.reshape(-1, 2), np.float64)
 
 
 def record(setting: BoardSetting, seed: int, session: int = 0) -> BoardRecording:

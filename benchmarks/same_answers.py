@@ -223,8 +223,7 @@ def compare(before: object, after: object) -> Row:
 
 def _relative(first: object, second: object) -> float:
     """Relative difference of two numbers; infinite of anything else."""
-    numbers = isinstance(first, int | float) and isinstance(second, int | float)
-    if not numbers:
+    if not isinstance(first, int | float) or not isinstance(second, int | float):
         return math.inf
     return abs(first - second) / max(abs(first), abs(second))
 

@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from evercal.typing import Array
 from rooms.clutter import SmallObjects
 from rooms.furniture import FurnitureBuilder
 from rooms.items import Item, overlaps
@@ -29,7 +28,7 @@ class Builder:
         self.trinkets = SmallObjects(self.shop)
         self.hangings = WallObjects(self.shop)
         self.items: list[Item] = []
-        self.blocked: list[tuple[Item | None, Array]] = []
+        self.blocked: list[tuple[Item | None, np.ndarray]] = []
         """Bounding boxes of items, and of space that stays free."""
 
     def add(self, item: Item, gap_m: float = 0.03, host: Item | None = None) -> bool:
@@ -44,7 +43,7 @@ class Builder:
         self.blocked.append((item, bounds))
         return True
 
-    def at_wall(self, wall: int, along: float, gap_m: float = 0.0) -> Array:
+    def at_wall(self, wall: int, along: float, gap_m: float = 0.0) -> np.ndarray:
         """Position (x, y) that is `along` metres along a wall and `gap_m` away from it."""
         spot = np.full(2, gap_m)
         if wall in (0, 3):
@@ -59,7 +58,7 @@ class Builder:
         along = half + share * (self.size[wall % 2] - 2 * half)
         gap = 0.015 if z == 0.0 else 0.003
         spot = self.at_wall(wall, along, gap)
-        return self.add(item.placed(*spot, z, WALL_YAW_RAD[wall]))
+        return self.add(item.placed(spot[0], spot[1], z, WALL_YAW_RAD[wall]))
 
     def try_wall(
         self, make: Callable[[], Item], walls: tuple[int, ...], z: float = 0.0

@@ -96,7 +96,8 @@ def moved_item(item: Item, room: Room, rest: list[Item], rng: Generator) -> Item
     """The item at a free position on the floor or on furniture; None after 60 failed attempts."""
     low, high = item.bounds_m()
     middle = (low + high)[:2] / 2
-    at_origin = item.placed(*-middle, -low[2])
+    x, y = -middle
+    at_origin = item.placed(x, y, -low[2])
     on_floor = low[2] < room.low_m[2] + 0.01
     tops = [(other, top) for other in rest for top in other.tops]
     area = np.array([(x1 - x0) * (y1 - y0) for _, (x0, x1, y0, y1, _) in tops])
@@ -113,7 +114,7 @@ def moved_item(item: Item, room: Room, rest: list[Item], rng: Generator) -> Item
             spot = rng.uniform((x0, y0), (x1, y1))
             z += 0.001
         yaw = rng.uniform(0, 2 * np.pi)
-        moved = at_origin.placed(*spot, z, yaw)
+        moved = at_origin.placed(spot[0], spot[1], z, yaw)
         blocks_work = host is rest[0] and np.hypot(*(spot - _WORK_M)) < 0.16
         far = np.hypot(*(spot - middle)) >= MOVED_M
         if far and not blocks_work and _fits(moved, room, rest, host):

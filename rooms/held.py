@@ -28,7 +28,6 @@ from evercal.simulation.panda_arm import (
     joints_for,
 )
 from evercal.storage import write_bytes, write_json
-from evercal.typing import Array
 from rooms.changed import rearranged
 from rooms.items import Parts
 from rooms.panda import panda_meshes
@@ -91,7 +90,7 @@ class Plan:
     base_from_camera: SE3
     base_from_gripper: SE3
     gripper_from_thing: SE3
-    joints_rad: Array
+    joints_rad: np.ndarray
     """(images, 7)."""
     scale: float
     """Size of the thing in parts of `SIZES_M`."""
@@ -215,7 +214,7 @@ class _View(NamedTuple):
 
     camera: Camera
     base_from_camera: SE3
-    middle_m: Array
+    middle_m: np.ndarray
     """Centre of the thing's motion."""
     facing_rad: float
     """Yaw of the thing's front, which is towards the camera."""
@@ -264,7 +263,9 @@ def _grip(setting: Setting, scale: float, rng: Generator) -> SE3:
     return hand @ SE3.exp([*rng.uniform(-0.01, 0.01, 3), *tilt])
 
 
-def _arm_poses(setting: Setting, view: _View, rng: Generator) -> list[Array] | None:
+def _arm_poses(
+    setting: Setting, view: _View, rng: Generator
+) -> list[np.ndarray] | None:
     """Joint angles of each image, or None where the arm reaches too few poses."""
     # z of the thing points down and its front, y, to the camera.
     y = np.array([np.cos(view.facing_rad), np.sin(view.facing_rad), 0.0])
@@ -307,7 +308,7 @@ def _arm_poses(setting: Setting, view: _View, rng: Generator) -> list[Array] | N
     return None
 
 
-def camera_holds(camera: Camera, pixels: Array) -> bool:
+def camera_holds(camera: Camera, pixels: np.ndarray) -> bool:
     """Whether pixels (n, 2) are at least 4 px inside the image."""
     high = (camera.width - 5, camera.height - 5)
     return bool(((pixels >= 4) & (pixels <= high)).all())
@@ -334,7 +335,7 @@ def _with_break(setting: Setting, plan: Plan, rng: Generator) -> Plan:
     return replace(plan, base_from_camera=plan.base_from_camera @ steps)
 
 
-def _walk(plan: Plan, seed: list[int]) -> Array:
+def _walk(plan: Plan, seed: list[int]) -> np.ndarray:
     """base_from_person: beyond the arm, in the camera's view."""
     rng = np.random.default_rng(seed)
     ahead = plan.base_from_camera[0].rotation_matrix()[:2, 2]
@@ -347,5 +348,5 @@ def _walk(plan: Plan, seed: list[int]) -> Array:
     return matrix
 
 
-def _moved(parts: Parts, matrix: Array) -> Parts:
+def _moved(parts: Parts, matrix: np.ndarray) -> Parts:
     return [(mesh.transformed(matrix), material) for mesh, material in parts]

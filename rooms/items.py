@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evercal.typing import Array
 from rooms.materials import Material
 from rooms.shapes import Mesh
 
@@ -14,7 +13,9 @@ Parts = list[tuple[Mesh, Material]]
 """Meshes with their materials."""
 
 
-def overlaps(bounds_m: Array, boxes_m: Sequence[Array], gap_m: ArrayLike) -> bool:
+def overlaps(
+    bounds_m: np.ndarray, boxes_m: Sequence[np.ndarray], gap_m: ArrayLike
+) -> bool:
     """Whether a bounding box (2, 3) is within a gap of one of others."""
     low, high = np.stack(boxes_m, 1)
     near = (bounds_m[0] < high + gap_m) & (bounds_m[1] > low - gap_m)
@@ -42,7 +43,7 @@ class Item:
         """Add a surface at height z, from -x to x and from y = -front to y = -back."""
         self.tops.append((-x, x, -front, -back, z))
 
-    def bounds_m(self) -> Array:
+    def bounds_m(self) -> np.ndarray:
         """Lowest and highest corner, shape (2, 3)."""
         points = np.concatenate([mesh.vertices_m for mesh, _ in self.parts])
         return np.stack([points.min(0), points.max(0)])

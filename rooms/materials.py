@@ -12,7 +12,7 @@ import numpy as np
 from numpy.random import Generator
 
 from evercal.simulation.textures import dead_leaves, one_over_f
-from evercal.typing import Array, Image
+from evercal.typing import Image
 
 Colour = tuple[float, float, float]
 """sRGB in [0, 1]."""
@@ -75,7 +75,7 @@ class Material:
         return {"type": "area", "radiance": radiance, "sampling_weight": weight}
 
 
-def linear(srgb: Array | Image) -> Array:
+def linear(srgb: np.ndarray | Image) -> np.ndarray:
     """Convert sRGB bytes to linear values in [0, 1]."""
     value = np.asarray(srgb, float) / 255
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
@@ -246,19 +246,19 @@ def brushed(name: str, rgb: Colour, rng: Generator) -> Material:
 
 
 @lru_cache(maxsize=8)
-def _noise_bank(exponent: float) -> Array:
+def _noise_bank(exponent: float) -> np.ndarray:
     rng = np.random.default_rng([7, round(10 * exponent)])
     return np.stack([one_over_f(SIZE, exponent, rng) for _ in range(3)])
 
 
-def _noise(exponent: float, rng: Generator) -> Array:
+def _noise(exponent: float, rng: Generator) -> np.ndarray:
     """Tiling noise (SIZE, SIZE): one of three stored ones, shifted and flipped for speed."""
     noise = _noise_bank(exponent)[rng.integers(3)]
     noise = np.roll(noise, rng.integers(0, SIZE, 2), (0, 1))
     return noise[:: rng.choice((1, -1))]
 
 
-def _stretched(rng: Generator, factor: int) -> Array:
+def _stretched(rng: Generator, factor: int) -> np.ndarray:
     """Noise stretched along u by `factor`."""
     short = _noise(1, rng)[:, : max(SIZE // factor, 4)]
     short = np.concatenate([short, short[:, ::-1]], 1)  # mirrored, so that it tiles
@@ -266,17 +266,17 @@ def _stretched(rng: Generator, factor: int) -> Array:
     return drawn.astype(np.float32)
 
 
-def _shaded(rgb: Colour | Array, value: Array) -> Array:
+def _shaded(rgb: Colour | np.ndarray, value: np.ndarray) -> np.ndarray:
     """A colour times brightness values (h, w), shape (h, w, 3)."""
     return np.array(rgb) * value[..., None]
 
 
-def _bytes(picture: Array) -> Image:
+def _bytes(picture: np.ndarray) -> Image:
     """Bytes of sRGB values in [0, 1]."""
     return clipped(np.round(picture * 255))
 
 
-def clipped(picture: Array) -> Image:
+def clipped(picture: np.ndarray) -> Image:
     """Bytes of values in [0, 255]."""
     return np.clip(picture, 0, 255).astype(np.uint8)
 

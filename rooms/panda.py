@@ -13,7 +13,6 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.simulation.panda_arm import joint_frames
-from evercal.typing import Array
 from rooms.items import Parts
 from rooms.materials import Material, plain
 from rooms.shapes import Mesh
@@ -21,7 +20,7 @@ from rooms.shapes import Mesh
 _MESHES = "share/example-robot-data/robots/panda_description/meshes/visual"
 
 
-def panda_meshes(joints_rad: Array, opening_m: float = 0.03) -> Parts:
+def panda_meshes(joints_rad: np.ndarray, opening_m: float = 0.03) -> Parts:
     """Meshes of the arm in the base frame, one named mesh for each colour.
 
     Args:
@@ -47,7 +46,7 @@ def panda_meshes(joints_rad: Array, opening_m: float = 0.03) -> Parts:
     return [(Mesh.merged(group), material) for material, group in groups.values()]
 
 
-def _fingers(opening_m: float) -> list[Array]:
+def _fingers(opening_m: float) -> list[np.ndarray]:
     """hand_from_finger of both fingers; the second one is the first one turned about z."""
     left = SE3.from_translation((0, opening_m, 0.0584))
     return [left.matrix(), (SE3.exp([0, 0, 0, 0, 0, np.pi]) @ left).matrix()]

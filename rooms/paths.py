@@ -15,7 +15,6 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.simulation.box_room import look_at
 from evercal.simulation.panda_arm import HOME_RAD
-from evercal.typing import Array
 from rooms.room import Room
 from rooms.shapes import positions
 
@@ -39,7 +38,7 @@ class Shot:
     """Training or test."""
     base_from_camera: SE3
     """Camera pose, shape ()."""
-    joints_rad: Array
+    joints_rad: np.ndarray
     """(7,) joint angles of the arm."""
 
 
@@ -57,7 +56,7 @@ def sweep_shots(room: Room, frames: int, seed: int) -> list[Shot]:
     return _shots("train", train, arm_train) + _shots("test", test, arm_test)
 
 
-def _shots(name: str, poses: Iterable[SE3], joints_rad: Array) -> list[Shot]:
+def _shots(name: str, poses: Iterable[SE3], joints_rad: np.ndarray) -> list[Shot]:
     """Numbered training frames, called train, or test frames of another name."""
     split = "train" if name == "train" else "test"
     return [
@@ -118,7 +117,7 @@ def hand_camera(seed: int) -> SE3:
     return SE3.from_translation((0.085, 0.0, 0.02)) @ SE3.exp(tangent)
 
 
-def hand_joints(frames: int, seed: int) -> Array:
+def hand_joints(frames: int, seed: int) -> np.ndarray:
     """Random joint angles with the flange high and tilted over the table, shape (frames, 7).
 
     Filter them with `sees_work_area`.
@@ -138,7 +137,7 @@ def sees_work_area(base_from_camera: SE3) -> bool:
 
 def _arm_path(
     frames: int, seed: list[int], hold: int, cycles: float | None = None
-) -> Array:
+) -> np.ndarray:
     """Joint angles around the ready position, constant for `hold` frames, shape (frames, 7)."""
     rng = np.random.default_rng(seed)
     step = np.arange(frames) // hold * hold
@@ -160,7 +159,7 @@ def _free_path(room: Room, frames: int, seed: list[int]) -> SE3:
     raise InputError(f"{room.kind} {room.seed}: no free camera path; use another seed")
 
 
-def is_clear(room: Room, points: Array) -> Array:
+def is_clear(room: Room, points: np.ndarray) -> np.ndarray:
     """Whether points (n, 3) are outside all objects and outside the arm's reach above its table."""
     near_arm = np.linalg.norm(points - (0.2, 0.0, 0.45), axis=-1) < 0.62
     return room.is_free(points) & ~near_arm
@@ -171,7 +170,7 @@ def _sweep(frames: int, rng: np.random.Generator) -> SE3:
     cycles = 1.0 + frames / 500
     t = np.linspace(0, 2 * np.pi * cycles, max(frames, 2), endpoint=False)[:frames]
 
-    def wave(low: float, high: float, speed: float) -> Array:
+    def wave(low: float, high: float, speed: float) -> np.ndarray:
         phase = rng.uniform(0, 2 * np.pi, 2)
         mix = 0.7 * np.sin(speed * t + phase[0]) + 0.3 * np.sin(
             2.6 * speed * t + phase[1]

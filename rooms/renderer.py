@@ -16,7 +16,6 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.processes import status_of
-from evercal.typing import Array
 from rooms.items import Parts
 from rooms.materials import Material
 from rooms.shapes import Mesh
@@ -157,7 +156,7 @@ class Renderer:
             self._replace(f"{mesh.name}.vertex_normals", mesh.normals)
         self._parameters.update()
 
-    def _replace(self, key: str, value: Array) -> None:
+    def _replace(self, key: str, value: np.ndarray) -> None:
         flat = np.ascontiguousarray(value, np.float32).ravel()
         self._parameters[key] = type(self._parameters[key])(flat)
 
@@ -167,7 +166,7 @@ class Renderer:
         base_from_camera: SE3,
         options: RenderOptions | None = None,
         seed: int = 0,
-    ) -> Array:
+    ) -> np.ndarray:
         """Render one image.
 
         A batch of poses (n,) base_from_camera is a motion during the exposure. One variant gives
@@ -201,7 +200,7 @@ class Renderer:
         radiance = light.astype(float) * self._exposure * 2.0**options.exposure_ev
         return _encode(radiance, options.noise, np.random.default_rng([seed, 1]))
 
-    def depth(self, camera: Camera, base_from_camera: SE3) -> Array:
+    def depth(self, camera: Camera, base_from_camera: SE3) -> np.ndarray:
         """Depth along the optical axis, float32 metres, shape (H, W); 0 for a miss."""
         mi = self._mi
         v, u = np.mgrid[0 : camera.height, 0 : camera.width]
@@ -259,7 +258,7 @@ class Renderer:
         return self._sensors[camera]
 
 
-def _denoised(light: Array, features: Array) -> Array:
+def _denoised(light: np.ndarray, features: np.ndarray) -> np.ndarray:
     """Radiance (H, W, 3) without noise; `features` are albedo and normal of the first surface."""
     import mitsuba_oidn as oidn  # pyright: ignore[reportMissingImports]
 
@@ -268,7 +267,7 @@ def _denoised(light: Array, features: Array) -> Array:
     return np.asarray(oidn.denoise(light, albedo, normal, hdr=True))
 
 
-def _encode(radiance: Array, noise: float, rng: np.random.Generator) -> Array:
+def _encode(radiance: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarray:
     """Radiance to sRGB bytes with a soft shoulder for highlights."""
     knee = 0.7
     over = np.maximum(radiance - knee, 0.0)

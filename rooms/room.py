@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evercal.typing import Array, BoolArray
+from evercal.typing import BoolArray
 from rooms.builder import WALL_YAW_RAD, Builder
 from rooms.items import Item, Parts
 from rooms.shapes import FORWARD, mirrored
@@ -36,12 +36,12 @@ class Room:
     """Walls, floor, ceiling, windows and lamps."""
     items: list[Item]
     """Furniture and small objects."""
-    low_m: Array
+    low_m: np.ndarray
     """Lowest corner, shape (3,)."""
-    high_m: Array
+    high_m: np.ndarray
     """Highest corner, shape (3,)."""
 
-    def boxes_m(self) -> Array:
+    def boxes_m(self) -> np.ndarray:
         """Bounding boxes of all items, shape (n, 2, 3)."""
         return np.stack([item.bounds_m() for item in self.items])
 
@@ -49,7 +49,7 @@ class Room:
         """All meshes with their materials."""
         return sum((item.parts for item in self.items), self.shell)
 
-    def is_free(self, points_m: Array, margin_m: float = 0.12) -> BoolArray:
+    def is_free(self, points_m: np.ndarray, margin_m: float = 0.12) -> BoolArray:
         """Whether points (n, 3) are inside the room and outside all items, with a margin."""
         above = points_m > self.low_m + margin_m
         inside = above & (points_m < self.high_m - margin_m)
@@ -263,5 +263,5 @@ def _fill_up(build: Builder) -> None:
         for _ in range(20):
             spot = rng.uniform(0.25, build.size[:2] - 0.25)
             by_wall = np.minimum(spot, build.size[:2] - spot).min() < 0.9
-            if by_wall and build.add(thing.placed(*spot, 0.0)):
+            if by_wall and build.add(thing.placed(spot[0], spot[1], 0.0)):
                 break

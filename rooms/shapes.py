@@ -10,20 +10,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evercal.typing import Array
-
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Triangles with smooth normals."""
 
-    vertices_m: Array
+    vertices_m: np.ndarray
     """Positions, shape (n, 3)."""
-    faces: Array
+    faces: np.ndarray
     """Vertex indices, counter-clockwise from outside, shape (m, 3)."""
-    normals: Array
+    normals: np.ndarray
     """Outward unit normals, shape (n, 3)."""
-    uv: Array
+    uv: np.ndarray
     """Texture coordinates, metres along the surface, shape (n, 2)."""
     name: str = ""
     """Name of a mesh that can be moved; empty for static meshes."""
@@ -51,7 +49,9 @@ class Mesh:
         rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return self.rotated(rotation, position_m)
 
-    def rotated(self, rotation: Array, position_m: ArrayLike = (0, 0, 0)) -> "Mesh":
+    def rotated(
+        self, rotation: np.ndarray, position_m: ArrayLike = (0, 0, 0)
+    ) -> "Mesh":
         """The mesh rotated by a (3, 3) matrix, then shifted."""
         return replace(
             self,
@@ -59,7 +59,7 @@ class Mesh:
             normals=self.normals @ rotation.T,
         )
 
-    def transformed(self, matrix: Array) -> "Mesh":
+    def transformed(self, matrix: np.ndarray) -> "Mesh":
         """The mesh moved by a rigid transform (4, 4)."""
         return self.rotated(matrix[:3, :3], matrix[:3, 3])
 
@@ -72,7 +72,7 @@ class Mesh:
         return replace(self, vertices_m=self.vertices_m * factor, uv=self.uv * factor)
 
 
-def about_x(angle_rad: float) -> Array:
+def about_x(angle_rad: float) -> np.ndarray:
     """Rotation matrix about x."""
     c = np.cos(angle_rad)
     s = np.sin(angle_rad)
@@ -83,7 +83,7 @@ FORWARD = about_x(np.pi / 2)
 """Rotation that turns z, the axis of a body of revolution, to -y, the front of furniture."""
 
 
-def about_y(angle_rad: float) -> Array:
+def about_y(angle_rad: float) -> np.ndarray:
     """Rotation matrix about y."""
     c = np.cos(angle_rad)
     s = np.sin(angle_rad)
@@ -95,24 +95,24 @@ def mirrored(x: float) -> tuple[float, float]:
     return -x, x
 
 
-def positions(*coordinates: ArrayLike) -> Array:
+def positions(*coordinates: ArrayLike) -> np.ndarray:
     """Points (..., n) from n coordinates, each an array or one number for all points."""
     return np.stack(np.broadcast_arrays(*coordinates), -1)
 
 
-def _unit(vectors: Array) -> Array:
+def _unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors (..., n) scaled to length 1; zeros stay zeros."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.maximum(length, 1e-12)
 
 
-def _arc_length(path: Array) -> Array:
+def _arc_length(path: np.ndarray) -> np.ndarray:
     """Distance from the first of the points (n, d) along their path, shape (n, 1)."""
     steps = np.linalg.norm(np.diff(path, axis=0), axis=-1)
     return np.concatenate([[0], np.cumsum(steps)])[:, None]
 
 
-def _grid(points: Array, normals: Array, uv: Array) -> Mesh:
+def _grid(points: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> Mesh:
     """A surface through points (rows, columns, 3); normals define the outside."""
     rows, columns = points.shape[:2]
     number = np.arange(rows * columns).reshape(rows, columns)
@@ -186,7 +186,7 @@ def lathe(profile: ArrayLike, segments: int = 28, smooth: int = 3) -> Mesh:
     return _grid(_revolved(points, angle), _revolved(normal, angle), uv)
 
 
-def _revolved(profile: Array, angle: Array) -> Array:
+def _revolved(profile: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Pairs (n, 2) along the radius and along z, turned about z by angles (m,): (n, m, 3)."""
     radius = profile[:, :1]
     return positions(radius * np.cos(angle), radius * np.sin(angle), profile[:, 1:])
@@ -198,7 +198,7 @@ def lampshade(*outside: tuple[float, float]) -> list[tuple[float, float]]:
     return [*outside, *inside]
 
 
-def _spline(points: Array, pieces: int) -> Array:
+def _spline(points: np.ndarray, pieces: int) -> np.ndarray:
     """A Catmull-Rom spline through points (k, 2)."""
     padded = np.concatenate([points[:1], points, points[-1:]])
     t = np.arange(pieces)[:, None] / pieces
@@ -266,7 +266,7 @@ def cushion(x: float, y: float, z: float, cells: int = 12) -> Mesh:
     return Mesh.merged(halves)
 
 
-def _normals(points: Array) -> Array:
+def _normals(points: np.ndarray) -> np.ndarray:
     """Upward unit normals of a height field (rows, columns, 3)."""
     normal = np.cross(*np.gradient(points, axis=(0, 1)))
     degenerate = np.linalg.norm(normal, axis=-1) <= 1e-12
@@ -284,7 +284,7 @@ def sheet(corner_m: ArrayLike, u_m: ArrayLike, v_m: ArrayLike) -> Mesh:
     return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), normal, uv)
 
 
-def _both_sides(points: Array, normals: Array, uv: Array) -> Mesh:
+def _both_sides(points: np.ndarray, normals: np.ndarray, uv: np.ndarray) -> Mesh:
     """A thin surface as two, 1 mm apart, because back sides are not rendered."""
     step = 5e-4 * normals
     front = _grid(points + step, normals, uv)

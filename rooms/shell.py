@@ -104,10 +104,12 @@ def _window(build: Builder, wall: int, share: float) -> Parts:
         window.add(box(w, 0.06, 0.05, 0.012), white, 0, -0.03, z)
     sill = box(w + 0.2, 0.2, 0.035, 0.014, steps=3)
     window.add(sill, white, 0, -0.1, low - 0.06)
-    window = window.placed(*position, 0.0, yaw)
+    x, y = position
+    window = window.placed(x, y, 0.0, yaw)
     build.blocked.append((None, window.bounds_m()))
     for side in (-1, 1):
         offset = np.array([np.cos(yaw), np.sin(yaw)]) * side * (w / 2 + 0.22)
         curtains = build.hangings.curtains(0.42)
-        build.add(curtains.placed(*(position + offset), 0.0, yaw), -0.25)
+        x, y = position + offset
+        build.add(curtains.placed(x, y, 0.0, yaw), -0.25)
     return window.parts

@@ -99,8 +99,9 @@ def _docstrings(tree: ast.AST) -> Iterator[ast.Expr]:
 
 
 def _is_docstring(node: ast.AST) -> bool:
-    text = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-    return text and isinstance(node.value.value, str)
+    if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Constant):
+        return False
+    return isinstance(node.value.value, str)
 
 
 def _is_packed(node: ast.AST) -> bool:

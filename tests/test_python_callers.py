@@ -36,8 +36,10 @@ WRONG: dict[str, tuple[Callable[[Map], object], str]] = {
     ),
     "a mount with hyphens": (
         lambda cell: cell.calibrate(
-            [IMAGE] * 4, robot_poses=POSES, mount="eye-in-hand"
-        ),  # pyright: ignore[reportArgumentType]
+            [IMAGE] * 4,
+            robot_poses=POSES,
+            mount="eye-in-hand",  # pyright: ignore[reportArgumentType]
+        ),
         "mount 'eye-in-hand': give eye_to_hand or eye_in_hand",
     ),
     "a mount of a calibration": (

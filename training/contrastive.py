@@ -19,7 +19,6 @@ from evercal.continual.networks.precision import autocast
 from evercal.errors import InputError
 from evercal.processes import started_safely
 from evercal.storage.atomic import write_bytes
-from evercal.typing import Array
 from rooms.renderer import mitsuba
 from training.furnished import cached_furnished_views
 from training.network import TEACHER, LocalEncoder
@@ -85,7 +84,7 @@ class PretrainData:
     """Rendered training data."""
 
     rooms: Sequence[Views]
-    pictures: list[Array]
+    pictures: list[np.ndarray]
     furnished: Sequence[Views] = ()
 
 
@@ -170,7 +169,7 @@ class PairStream(IterableDataset):
         first, second = anchor + rng.choice(PER_ANCHOR, 2, replace=False)
         return view_pair(views, int(first), int(second), rng)
 
-    def _picture(self, rng: Generator) -> Array:
+    def _picture(self, rng: Generator) -> np.ndarray:
         return self.data.pictures[rng.integers(len(self.data.pictures))]
 
     def __iter__(self) -> Iterator[Batch]:

@@ -13,7 +13,6 @@ from evercal.simulation.box_room import look_at
 from evercal.simulation.panda_arm import HOME_RAD
 from evercal.storage import write_bytes
 from evercal.storage.settings import lock_settings
-from evercal.typing import Array
 from rooms.panda import panda_meshes
 from rooms.paths import is_clear
 from rooms.renderer import Renderer, RenderOptions
@@ -29,24 +28,24 @@ OCCLUSION = 0.02
 class FurnishedViews:
     """`Views` of a furnished room, with surfaces from depth maps."""
 
-    images: Array
+    images: np.ndarray
     base_from_camera: SE3
     cameras: tuple[Camera, ...]
-    depth_m: Array
+    depth_m: np.ndarray
     """(n, HEIGHT, WIDTH) float16 metres along the optical axis; 0 without a surface."""
 
-    def _depth(self, view: int, pixels: Array) -> Array:
+    def _depth(self, view: int, pixels: np.ndarray) -> np.ndarray:
         u, v = np.rint(pixels).astype(int).T
         return self.depth_m[view, v, u].astype(float)
 
-    def hit(self, view: int, pixels: Array) -> Array:
+    def hit(self, view: int, pixels: np.ndarray) -> np.ndarray:
         """Intersect rays with surfaces; see `Views`."""
         depth = self._depth(view, pixels)
         depth[depth == 0] = np.nan
         points = self.cameras[view].unproject(pixels) * depth[:, None]
         return self.base_from_camera[view].apply(points)
 
-    def visible(self, view: int, points_m: Array) -> Array:
+    def visible(self, view: int, points_m: np.ndarray) -> np.ndarray:
         """Test for occlusion; see `Views`."""
         within = self.base_from_camera[view].inverse().apply(points_m)
         depth = self._depth(view, self.cameras[view].project(within))

@@ -11,7 +11,7 @@ from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.simulation.box_room import BoxRoom, look_at
 from evercal.simulation.textures import dead_leaves
-from evercal.typing import Array, Image
+from evercal.typing import Image
 
 HEIGHT = 192
 WIDTH = 256
@@ -28,9 +28,9 @@ VALIDATION_ROOM_SEED = FIRST_ROOM_SEED + 7_000
 class Pair:
     """Two grey images with corresponding pixels."""
 
-    images: Array
+    images: np.ndarray
     """(2, HEIGHT, WIDTH) uint8."""
-    pixels: Array
+    pixels: np.ndarray
     """(2, n, 2) float32 pixels (u, v); row k is one surface point in both images."""
 
 
@@ -39,16 +39,16 @@ def pinhole(focal: float) -> Camera:
     return Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 
 
-def cell_pixels() -> Array:
+def cell_pixels() -> np.ndarray:
     """Return the centres (u, v) of the stride-8 cells, ((HEIGHT / 8) (WIDTH / 8), 2)."""
     v, u = np.mgrid[0 : HEIGHT // 8, 0 : WIDTH // 8]
     return np.stack([u, v], -1).reshape(-1, 2) * 8.0 + 3.5
 
 
-def inside(pixels: Array, margin: float = 3.5) -> Array:
+def inside(pixels: np.ndarray, margin: float = 3.5) -> np.ndarray:
     """Return a mask (n,) of pixels at least `margin` from the border."""
     high = (WIDTH - 1 - margin, HEIGHT - 1 - margin)
-    return ((pixels >= margin) & (pixels <= high)).all(-1)
+    return np.asarray(((pixels >= margin) & (pixels <= high)).all(-1))
 
 
 def room_seeds(count: int) -> range:
@@ -56,7 +56,7 @@ def room_seeds(count: int) -> range:
     return range(FIRST_ROOM_SEED, FIRST_ROOM_SEED + count)
 
 
-def random_homography(side: int, rng: Generator) -> Array:
+def random_homography(side: int, rng: Generator) -> np.ndarray:
     """Draw a (3, 3) homography from image pixels to pixels of a square picture."""
     scale = np.exp(rng.uniform(np.log(0.6), np.log(1.7)))
     angle = rng.normal(0, 0.3)
@@ -67,11 +67,11 @@ def random_homography(side: int, rng: Generator) -> Array:
     corners = corners @ np.array([[c, s], [-s, c]])
     corners *= 1 + rng.uniform(-0.2, 0.2, (4, 2))
     corners += side / 2 + rng.uniform(-0.12, 0.12, 2) * side
-    border = square * np.float32([WIDTH - 1, HEIGHT - 1])
+    border = square * np.array([WIDTH - 1, HEIGHT - 1], np.float32)
     return cv2.getPerspectiveTransform(border, corners.astype(np.float32))
 
 
-def homography_pair(picture: Array, rng: Generator) -> Pair:
+def homography_pair(picture: np.ndarray, rng: Generator) -> Pair:
     """Warp one grey (s, s) uint8 picture to two random perspective views."""
     maps = []
     images = []
@@ -95,7 +95,7 @@ def homography_pair(picture: Array, rng: Generator) -> Pair:
     return Pair(np.stack(images), pixels.astype(np.float32))
 
 
-def _random_pixels(rng: Generator) -> Array:
+def _random_pixels(rng: Generator) -> np.ndarray:
     """One random pixel (u, v) of each cell, in the order of `cell_pixels`."""
     centres = cell_pixels()
     return centres + rng.uniform(-3.5, 3.5, centres.shape)
@@ -104,18 +104,18 @@ def _random_pixels(rng: Generator) -> Array:
 class Views(Protocol):
     """Views of one room; each group of `PER_ANCHOR` consecutive views shows the same part."""
 
-    images: Array
+    images: np.ndarray
     """(n, HEIGHT, WIDTH) uint8 grey."""
     base_from_camera: SE3
     """(n,) poses."""
     cameras: tuple[Camera, ...]
     """n pinhole cameras; the focal length differs between anchors."""
 
-    def hit(self, view: int, pixels: Array) -> Array:
+    def hit(self, view: int, pixels: np.ndarray) -> np.ndarray:
         """Return the (n, 3) surface points at (n, 2) pixels of a view; NaN without a surface."""
         ...
 
-    def visible(self, view: int, points_m: Array) -> Array:
+    def visible(self, view: int, points_m: np.ndarray) -> np.ndarray:
         """Return a mask (n,) of points (n, 3) within the image that no surface occludes."""
         ...
 
@@ -124,19 +124,19 @@ class Views(Protocol):
 class RoomViews:
     """`Views` of a box room."""
 
-    images: Array
+    images: np.ndarray
     base_from_camera: SE3
     cameras: tuple[Camera, ...]
     geometry: BoxRoom
     """The room without its textures, which would use much memory."""
 
-    def hit(self, view: int, pixels: Array) -> Array:
+    def hit(self, view: int, pixels: np.ndarray) -> np.ndarray:
         """Intersect rays with surfaces; see `Views`."""
         pose = self.base_from_camera[view]
         rays = self.cameras[view].unproject(pixels) @ pose.rotation_matrix().T
         return self.geometry.intersect(pose.translation_m, rays)[0]
 
-    def visible(self, view: int, points_m: Array) -> Array:
+    def visible(self, view: int, points_m: np.ndarray) -> np.ndarray:
         """Test for occlusion; see `Views`."""
         eye = self.base_from_camera[view].translation_m
         _, depth = self.geometry.intersect(eye, points_m - eye)
@@ -187,7 +187,7 @@ def view_pair(views: Views, first: int, second: int, rng: Generator) -> Pair:
     return Pair(images, np.stack([pixels[keep], projected[keep]]).astype(np.float32))
 
 
-def photometric(image: Array, rng: Generator) -> Array:
+def photometric(image: np.ndarray, rng: Generator) -> np.ndarray:
     """Change exposure, contrast, gamma, shading, blur and noise at random; uint8."""
     x = image.astype(np.float32) / 255.0
     if rng.random() < 0.35:
@@ -218,6 +218,6 @@ def seeded_picture(seed: int) -> Image:
     return leaf_picture(np.random.default_rng([seed, 3]))
 
 
-def leaf_picture(rng: Generator, side: int = 448) -> Array:
+def leaf_picture(rng: Generator, side: int = 448) -> np.ndarray:
     """Draw a grey (side, side) uint8 dead-leaves picture."""
     return cv2.cvtColor(dead_leaves(side, side, rng), cv2.COLOR_RGB2GRAY)

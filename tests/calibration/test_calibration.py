@@ -30,7 +30,7 @@ def example() -> Calibration:
         Camera(640, 480, 600, 601, 320, 240),
         (ImageUse("a.png", True, "", 0.5, 0.1), ImageUse("b.png", False, "blurred")),
         (ErrorTerm("map", 0.3, 0.01),),
-        {"held_out_mm": 1.5},
+        checks_of({"held_out_mm": 1.5}),
         "good for bin picking",
         {"command": "solve"},
         "2026-01-01T00:00:00+00:00",

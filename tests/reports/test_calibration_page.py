@@ -63,12 +63,14 @@ def full(**changes: Any) -> Calibration:
             ErrorTerm("landmarks and lens", 0.2, 0.001),
             ErrorTerm("scatter", 0.05, 0.0002),
         ),
-        {
-            "repeatability_mm": 0.31,
-            "repeatability_deg": 0.013,
-            "held_out_mm": 2.25,
-            "spots": 3,
-        },
+        checks_of(
+            {
+                "repeatability_mm": 0.31,
+                "repeatability_deg": 0.013,
+                "held_out_mm": 2.25,
+                "spots": 3,
+            }
+        ),
         "Good enough for bin picking. Move closer.",
         {
             "command": "calibrate",

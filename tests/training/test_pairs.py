@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from evercal.simulation.box_room import BoxRoom
-from evercal.typing import Array
 from training.pairs import (
     HEIGHT,
     WIDTH,
@@ -23,7 +22,7 @@ from .conftest import SEED
 pytestmark = pytest.mark.slow("training", "src/evercal/features")
 
 
-def hit(views: RoomViews, index: int, pixels: Array) -> Array:
+def hit(views: RoomViews, index: int, pixels: np.ndarray) -> np.ndarray:
     """Intersect the rays of pixels with the room, (n, 3)."""
     pose = views.base_from_camera[index]
     rays = views.cameras[index].unproject(pixels) @ pose.rotation_matrix().T

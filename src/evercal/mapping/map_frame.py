@@ -220,15 +220,6 @@ def _shared(correction: Array, left: Array) -> float:
     return float(np.sqrt((correction**2).mean()))
 
 
-def _shared(correction: Array, left: Array) -> float:
-    """`shared_sigma` of three axes (n, 3), by what neighbours leave of the corrections."""
-    shared = float((left[:-1] * left[1:]).mean())
-    error = float((left**2).mean()) / np.sqrt(left[1:].size)
-    if shared <= 3 * error:
-        return 0.0
-    return float(np.sqrt((correction**2).mean()))
-
-
 def _left_out(
     poses: SE3,
     correction: Array,

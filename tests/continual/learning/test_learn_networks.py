@@ -13,13 +13,13 @@ import pytest
 from evercal.continual import threshold
 from evercal.continual.learning.learn_networks import (
     NetworkLearnOptions,
+    NetworkReport,
     learn_networks,
 )
 from evercal.continual.learning.stage import Encoding, StageOptions
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.store import NetworkStore, head_bytes
 from evercal.errors import InputError
-from evercal.learning.report import LearnReport
 
 from ..stages import Rooms, Tree
 
@@ -42,7 +42,7 @@ class Learned:
     """A store after two scenes."""
 
     root: Path
-    reports: list[LearnReport]
+    reports: list[NetworkReport]
     events: list[object]
 
 
