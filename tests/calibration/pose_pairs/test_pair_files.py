@@ -57,7 +57,7 @@ def test_messages_name_the_file_and_its_option(tmp_path: Path, role: str) -> Non
     )
     broken = tmp_path / f"{role}.csv"
     broken.write_text("1 2 3 4 5 6\n")
-    with pytest.raises(InputError, match=rf"{role}\.csv: .*--{role}-convention"):
+    with pytest.raises(InputError, match=rf"{role}\.csv: .*`{role}_convention`"):
         read_pairs(PairFiles(robot, camera))
     broken.unlink()
     with pytest.raises(
