@@ -261,9 +261,7 @@ def boards_seen(calibration: Calibration, folder: Path) -> dict[str, BoardSeen]:
     """The board in each image of a calibration by `evercal solve`, whose file lies in `folder`."""
     poses = calibration.checks.camera_from_board
     given = Path(str(calibration.source.get("camera_poses", "")))
-    file = next(
-        (f for f in (folder / given, given, folder / given.name) if f.is_file()), None
-    )
+    file = _existing([folder / given, given, folder / given.name])
     if not isinstance(poses, dict) or file is None:
         return {}
     try:
