@@ -35,6 +35,10 @@ VERBS = {
     "boards": ("boards", "detection of rendered boards, beside the finders of OpenCV"),
     "handeye-boards": ("hand_eye_boards", "boards and intrinsics from the same images"),
     "mistakes": ("mistakes", "mistakes in pose files, and clean recordings"),
+    "recording-mistakes": (
+        "recording_mistakes",
+        "mistakes in the stated poses of recordings that are learned",
+    ),
     "refresh": ("changing_room", "a map in a rendered room that changes in ten rounds"),
     "same-answers": ("same_answers", "answers of this tree, beside a commit's"),
     "speed": ("speed", "time of learning, localization and SARS"),
@@ -58,7 +62,7 @@ def main(args: list[str]) -> int:
     if verb not in VERBS:
         print("usage: python -m benchmarks VERB [--help]\n")
         print(
-            "\n".join(f"  {name:15} {summary}" for name, (_, summary) in VERBS.items())
+            "\n".join(f"  {name:18} {summary}" for name, (_, summary) in VERBS.items())
         )
         return 0 if verb in ("-h", "--help") else 2
     module = importlib.import_module(f"benchmarks.{VERBS[verb][0]}")

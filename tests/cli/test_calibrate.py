@@ -37,7 +37,9 @@ def test_folder_of_images_is_calibrated_and_checked(
     out = tmp_path / "calibration.json"
     ran = run("calibrate", hall_store, four_images, "--out", out)
     assert ran.code == 0, ran.err
-    assert "base_from_camera: the pose of camera in base" in ran.out
+    first = ran.out.splitlines()[0]
+    assert first.startswith("base_from_camera: the pose of camera in base")
+    assert first.endswith("; scene hall")
     assert "4 of 4 used" in ran.out
     estimate = read_calibration(out)
     assert pose_distance(estimate.parent_from_child, truth_of(hall.test[3]))[0] < 0.004

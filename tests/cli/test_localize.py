@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3, UncertainPose, pose_distance
+from evercal.localization.estimate import PoseEstimate
 from evercal.recordings import read_image, write_image
 
 KEYS = "path status reason scene base_from_camera covariance inliers inlier_ratio support ms"
@@ -74,6 +76,32 @@ def test_text_has_millimetres_and_the_next_command(run, hall_store, images):
     assert lines[4].endswith(" of the position's variance")
     assert lines[6] == str(files[1])
     assert lines[-1] == f"next: evercal localize {hall_store} {files[0]} --overlay DIR"
+
+
+def test_several_images_end_with_one_line_about_all(run, hall_store, images):
+    located, unknown = run.json("localize", hall_store, images)["images"]
+    mean = np.diagonal(located["covariance"])[:3].mean()
+    sd = f"standard deviation {1000 * np.sqrt(mean):.2f} mm per axis (median)"
+    words = unknown["status"].replace("_", " ")
+    lines = run("localize", hall_store, images).out.splitlines()
+    assert lines[-2] == f"1 of 2 images located, in hall 1; {sd}; refused: {words} 1"
+    (black,) = sorted(images.iterdir())[1:]
+    assert "located" not in run("localize", hall_store, black).out
+
+
+def test_a_refused_image_of_a_known_scene_names_it(
+    run, hall_store, images, monkeypatch
+):
+    from evercal.localization.localizer import Localizer
+
+    def localize(*_: object) -> PoseEstimate:
+        failed = PoseEstimate.failed("its position is uncertain")
+        return replace(failed, status="uncertain", scene="hall")
+
+    monkeypatch.setattr(Localizer, "localize", localize)
+    lines = run("localize", hall_store, images / "1-hall.png").out.splitlines()
+    assert lines[1].split() == ["scene", "hall"]
+    assert lines[2] == "  uncertain: its position is uncertain"
 
 
 def test_point_in_the_camera_frame_has_a_standard_deviation(run, hall_store, images):

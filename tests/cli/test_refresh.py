@@ -39,3 +39,15 @@ def test_the_stated_camera_is_used(
     assert given[1] is None
     (tmp_path / "now" / "scene.json").write_text("{")
     assert "scene.json" in run("refresh", hall_store, tmp_path / "now").err[0]
+
+
+def test_a_recording_without_training_frames_is_one_line(
+    run, hall_store, hall, tmp_path
+):
+    generic.write(tmp_path / "now", replace(hall, name="now", train=()))
+    ran = run("refresh", hall_store, tmp_path / "now")
+    assert ran.code == 2
+    assert ran.err == [
+        "error: recording 'now': no training frames, which refresh a map; give a folder of its"
+        " images"
+    ]

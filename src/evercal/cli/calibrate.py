@@ -137,7 +137,11 @@ def calibration_lines(
     from evercal.calibration.calibration import position_shares
 
     pose = calibration.parent_from_child
-    yield f"{calibration.parent_frame}_from_{calibration.child_frame}: the {calibration.meaning}"
+    scene = ""
+    if "scene" in calibration.source:
+        scene = f"; scene {calibration.source['scene']}"
+    frames = f"{calibration.parent_frame}_from_{calibration.child_frame}"
+    yield f"{frames}: the {calibration.meaning}{scene}"
     yield f"  translation  {numbers(1000 * pose.translation_m, '+.2f')} mm"
     yield f"  quaternion   {numbers(pose.rotation_wxyz, '+.6f')} wxyz"
     spread = f"{calibration.sigma_mm:.2f} mm, {calibration.sigma_deg:.3f} deg"

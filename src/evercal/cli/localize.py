@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,6 +69,7 @@ class Localize(args.Verb):
         for answer in answers:
             records.append(_record(answer, point))
             lines += _lines(answer, point)
+        lines += _summary(answers)
         if self.video is not None:
             self._animate(self.video, localizer, answers)
             lines.append(f"wrote {self.video}")
@@ -154,6 +156,11 @@ def _lines(answer: Answer, point: args.Point | None) -> Iterator[str]:
     time_ms = f"{answer.milliseconds:.0f} ms"
     inliers = f"  inliers      {estimate.inliers} {share}, {time_ms}"
     yield str(answer.path)
+    note = ""
+    if estimate.parent_frame == "gripper":
+        note = " (a thing in the gripper: the pose is gripper_from_camera)"
+    if estimate.scene is not None:
+        yield f"  scene        {estimate.scene}{note}"
     if pose is None:
         yield f"  {estimate.status.replace('_', ' ')}: {estimate.reason}"
         yield inliers
@@ -167,10 +174,6 @@ def _lines(answer: Answer, point: args.Point | None) -> Iterator[str]:
     unit = f"m{sd_mm}"
     if not answer.unit_known:
         unit = "in an unknown unit: run 'evercal align' first"
-    note = ""
-    if estimate.parent_frame == "gripper":
-        note = " (a thing in the gripper: the pose is gripper_from_camera)"
-    yield f"  scene        {estimate.scene}{note}"
     yield f"  translation  {numbers(pose.translation_m, '+.4f')} {unit}"
     yield f"  quaternion   {numbers(pose.rotation_wxyz, '+.4f')} wxyz{sd_deg}"
     budget = sorted(budget_of(estimate), key=lambda row: -row[1])
@@ -183,3 +186,35 @@ def _lines(answer: Answer, point: args.Point | None) -> Iterator[str]:
     if point is not None and uncertain is not None and answer.unit_known:
         yield f"  point        sd {point.text(uncertain)}"
     yield inliers
+
+
+def _summary(answers: list[Answer]) -> Iterator[str]:
+    """One line about several images: located where and how exactly, refused why."""
+    from statistics import median
+
+    if len(answers) < 2:
+        return
+    scenes: Counter[str] = Counter()
+    reasons: Counter[str] = Counter()
+    sigmas: list[float] = []
+    for answer in answers:
+        estimate = answer.estimate
+        if estimate.status != "ok":
+            reasons[estimate.status.replace("_", " ")] += 1
+            continue
+        scenes[str(estimate.scene)] += 1
+        pose = finite_pose(estimate)
+        if pose is not None and answer.unit_known:
+            sigmas.append(pose.sigma_mm)
+    line = f"{scenes.total()} of {len(answers)} images located"
+    if scenes:
+        line += f", in {_counts(scenes)}"
+    if sigmas:
+        line += f"; standard deviation {median(sigmas):.2f} mm per axis (median)"
+    if reasons:
+        line += f"; refused: {_counts(reasons)}"
+    yield line
+
+
+def _counts(words: Counter[str]) -> str:
+    return ", ".join(f"{word} {count}" for word, count in words.most_common())

@@ -58,8 +58,11 @@ class Refresh(args.Verb):
         with Bars(self.log) as bars:
             recording = _recording(self.images)
             if recording is not None:
-                first = recording.train[0].camera
-                camera = args.stated_camera(self.camera, (first.width, first.height))
+                camera = None
+                if recording.train:
+                    first = recording.train[0].camera
+                    shape = (first.width, first.height)
+                    camera = args.stated_camera(self.camera, shape)
                 report = cell.refresh(recording, camera=camera, on_progress=bars.step)
             else:
                 files = image_files(self.images)

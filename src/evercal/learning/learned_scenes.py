@@ -269,6 +269,11 @@ class LearnedScenes:
         if isinstance(images, Recording):
             given = [(frame.name, frame.image) for frame in images.train]
             cameras = [camera or frame.camera for frame in images.train]
+            if not given:
+                raise InputError(
+                    f"recording {images.name!r}: no training frames, which refresh a map; give a"
+                    " folder of its images"
+                )
         else:
             given = Images.of(images).images
             cameras = [camera] * len(given)
