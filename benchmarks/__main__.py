@@ -30,6 +30,7 @@ VERBS = {
         "fisheye",
         "rooms through lenses of 150 and 180 degrees, beside a pinhole",
     ),
+    "guard": ("guard", "real rooms, far views, cameras not as stated; beside a commit"),
     "same-model": ("same_model", "images of other cameras of the recording's model"),
     "handeye": ("hand_eye", "pose pairs: errors, ellipsoids, outliers, scale, time"),
     "boards": ("boards", "detection of rendered boards, beside the finders of OpenCV"),

@@ -51,7 +51,7 @@ def run(
     steps = [*_sample_steps()]
     if real is not None:
         steps += _real_steps(real.resolve(), out.resolve())
-    kept = _reference(reference, out)
+    kept = source_of(reference, out)
     # Relative paths in answers are equal in folders of the same depth.
     now = out.resolve() / "now" / "answers"
     shutil.rmtree(now, ignore_errors=True)
@@ -155,7 +155,7 @@ def _first_frames(source: Path, copy: Path) -> Path:
     return copy
 
 
-def _reference(commit: str, out: Path) -> Path:
+def source_of(commit: str, out: Path) -> Path:
     """The folder of a commit, with its source."""
     folder = out.resolve() / commit
     if not (folder / "src").is_dir():

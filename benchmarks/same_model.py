@@ -53,16 +53,16 @@ def run(
         frames: list[Frame] = []
         fixed: list[Sequence[Frame]] = []
         rooms = sample_rooms()
-        recorded = _seen(rooms[0].scene.train[0], np.zeros(4)).camera
+        recorded = seen(rooms[0].scene.train[0], np.zeros(4)).camera
         for room in rooms:
-            middle = tuple(_seen(frame, np.zeros(4)) for frame in room.scene.train)
+            middle = tuple(seen(frame, np.zeros(4)) for frame in room.scene.train)
             learned.learn(replace(room.scene, train=middle, test=()))
             frames += room.scene.test[::every]
             fixed += [room.fixed.test[:FIXED_IMAGES]] if room.fixed else []
         for name, changes in (("own", np.zeros((1, 4))), ("another", draws)):
-            images = [_seen(frame, change) for change in changes for frame in frames]
+            images = [seen(frame, change) for change in changes for frame in frames]
             views = [
-                [_seen(frame, change) for frame in of]
+                [seen(frame, change) for frame in of]
                 for change in changes
                 for of in fixed
             ]
@@ -84,7 +84,7 @@ def run(
     save(out, rows, settings)
 
 
-def _seen(frame: Frame, change: np.ndarray) -> Frame:
+def seen(frame: Frame, change: np.ndarray) -> Frame:
     """The middle of a frame as a camera with changed intrinsics (4,) sees it, see `SPREAD`."""
     own = frame.camera
     left = round(MARGIN * own.width)

@@ -1,0 +1,144 @@
+"""Real rooms, far views and cameras that are not as stated, beside other commits.
+
+Every build learns and locates the same recordings in a process of its own, by `guard_answers`.
+"""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.accuracy import wrong
+from benchmarks.guard_recordings import Case, prepared
+from benchmarks.rows import Row, grouped, median_of, numbers, once, save
+from benchmarks.same_answers import ROOT, source_of
+from evercal.errors import InputError
+
+NOW = "now"
+"""Name of the working tree's build."""
+POSITION_95 = 7.815
+"""95 % quantile of a squared deviation in three dimensions (chi-squared)."""
+POSE_95 = 12.592
+"""95 % quantile in six dimensions."""
+
+
+def run(
+    out: Path = Path("results/guard.csv"),
+    real: Path | None = None,
+    beside: tuple[str, ...] = ("175b928",),
+    only: str = "",
+    cache: Path = Path("runs/guard"),
+) -> None:
+    """Compare this build with others on rooms that are not as rendered ones.
+
+    Percentages and medians are of all images, refused ones among them; those inside the 95 %
+    ellipsoids are of the poses. An interrupted run continues.
+
+    Args:
+        out: File of rows to write.
+        real: Folder of real recordings with tsdf_room, redkitchen and fr1_rpy.
+        beside: Commits to compare with.
+        only: Part of the names of recordings that are learned.
+        cache: Folder for recordings and the answers of every build.
+    """
+    if real is None:
+        print("real rooms are left out: give their folder with --real")
+    cases = [
+        case
+        for case in prepared(cache.resolve() / "recordings", real)
+        if only in case.learn.name
+    ]
+    builds = {commit: source_of(commit, cache / "builds") / "src" for commit in beside}
+    builds[NOW] = ROOT / "src"
+    measured = {name: _measured(cases, src, cache) for name, src in builds.items()}
+    save(out, _compared(measured), {"beside": list(beside), "real": real is not None})
+
+
+def _compared(measured: dict[str, list[Row]]) -> list[Row]:
+    """Rows of all builds, by recording, with the differences of this build to others."""
+    rows: list[Row] = []
+    for number, now in enumerate(measured[NOW]):
+        olds = {name: of[number] for name, of in measured.items() if name != NOW}
+        rows += [{"build": name, **old} for name, old in olds.items()]
+        rows.append({"build": NOW, **now})
+        for name, old in olds.items():
+            rows.append({"build": f"{NOW} - {name}", **_difference(old, now)})
+    return rows
+
+
+def fingerprint(source: Path) -> str:
+    """Checksum of a build's files."""
+    total = hashlib.sha256()
+    for file in sorted(source.rglob("*")):
+        if file.suffix in (".py", ".safetensors", ".onnx"):
+            total.update(str(file.relative_to(source)).encode() + file.read_bytes())
+    return total.hexdigest()[:12]
+
+
+def _measured(cases: Sequence[Case], source: Path, cache: Path) -> list[Row]:
+    """Rows of a build, one for each recording that is located."""
+    kept = cache.resolve() / "answers" / fingerprint(source)
+    rows = []
+    for case in tqdm(cases, source.parent.name, unit="map"):
+        file = kept / f"{case.learn.name}.json"
+        images = once(file, partial(_answers, case, source))
+        for (name,), of in grouped(images, "recording").items():
+            what: Row = {"suite": case.suite, "recording": name}
+            rows.append(what | summary(of))
+    return rows
+
+
+def _answers(case: Case, source: Path) -> list[Row]:
+    """Answers of a build, in a process of its own."""
+    script = str(ROOT / "benchmarks" / "guard_answers.py")
+    done = subprocess.run(
+        [sys.executable, "-P", script, case.learn, case.memory, *case.ask],
+        env={**os.environ, "PYTHONPATH": str(source)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        raise InputError(f"{case.learn}: {done.stderr.strip()[-2000:]}")
+    return json.loads(done.stdout)
+
+
+def summary(answers: Sequence[Row]) -> Row:
+    """Accuracy, refusals and ellipsoids of the answers to one recording's images."""
+    count = len(answers)
+    located = numbers(answers, "mm")
+    position = numbers(answers, "position")
+    refused = np.full(count - len(located), np.inf)
+    mm = np.concatenate([located, refused])
+    deg = np.concatenate([numbers(answers, "deg"), refused])
+    return {
+        "n": count,
+        "2_cm": 100 * float(((mm <= 20) & (deg <= 2)).mean()),
+        "1_cm": 100 * float((mm <= 10).mean()),
+        "mm": median_of(mm),
+        "deg": median_of(deg),
+        "refused": 100 * len(refused) / count,
+        "inside_position": 100 * float((position <= POSITION_95).mean()),
+        "inside_pose": 100 * float((numbers(answers, "pose") <= POSE_95).mean()),
+        "wrong": int(wrong(located, position).sum()),
+        "learn_s": float(answers[0]["learn_s"]),
+        "ask_s": float(numbers(answers, "ask_s").sum()),
+    }
+
+
+def _difference(old: Row, now: Row) -> Row:
+    row: Row = {}
+    for key, value in now.items():
+        before = old[key]
+        if isinstance(value, str) or isinstance(before, str) or key == "n":
+            row[key] = value
+        else:
+            row[key] = value - before
+    return row

@@ -1,0 +1,285 @@
+"""Recordings for `guard`, written as 7-Scenes folders, which every build reads.
+
+Real rooms with training blocks left out, so that views are far from all keyframes. Packaged rooms
+as a stabilised phone or a rolling shutter records them. Images of another camera that is stated as
+the recording's.
+"""
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from benchmarks.same_model import seen
+from evercal.geometry import SE3, Camera
+from evercal.recordings import load_recording, posed_frames, write_image
+from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.samples import sample_rooms
+
+Image = np.ndarray
+"""uint8, shape (h, w, 3)."""
+TEST_IMAGES = 60
+"""Images of a recording that are located, at most."""
+OTHER_IMAGES = 39
+"""Images of another camera that are located."""
+SMOOTH_FRAMES = 3
+"""Standard deviation of the kernel that smooths errors over frames."""
+STATED_LONG = 1.02
+"""Factor on the focal length where wrong intrinsics are stated."""
+STABILISED_PX = (3.0, 6.0)
+"""Standard deviations of a principal point that moves."""
+ROLLING_PX = 2.0
+"""Largest shift of the first and last row of an image against the middle one."""
+OTHERS = {"longer": (0.01, 0.0, 0.0), "shorter": (-0.005, 3.0, -2.0)}
+"""Other cameras: change of the focal length as a share, of the principal point in pixels."""
+
+
+@dataclass(frozen=True)
+class RealRoom:
+    """How a real recording is learned and located."""
+
+    memory: str
+    """Keyframes that are kept."""
+    block: int = 0
+    """Training frames in a block of which every second one is left out and located; 0: none."""
+    focal_px: float | None = None
+    """Focal length that is right for the images, where the file states another."""
+
+
+REAL = {
+    "tsdf_room": RealRoom("10%", 25, 515.0),
+    "redkitchen": RealRoom("3%", 50),
+    "fr1_rpy": RealRoom("3%"),
+}
+"""Real rooms. The file of tsdf_room states the focal length of its depth camera."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A recording to learn, and those whose test images are located in it."""
+
+    suite: str
+    """Name of its suite."""
+    learn: Path
+    """Folder of the recording."""
+    ask: tuple[Path, ...]
+    """Folders."""
+    memory: str = "10%"
+    """Keyframes that are kept."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A folder of recordings; those that exist are kept."""
+
+    folder: Path
+    """One folder for each recording."""
+
+    def write(self, name: str, make: Callable[[], Recording]) -> Path:
+        """Write a recording of one camera as a 7-Scenes folder, whole or not at all."""
+        folder = self.folder / name
+        if folder.exists():
+            return folder
+        recording = make()
+        unfinished = folder.with_name(f"{name}.unfinished")
+        shutil.rmtree(unfinished, ignore_errors=True)
+        parts = (("Train", recording.train), ("Test", recording.test))
+        for number, (part, frames) in enumerate(parts, start=1):
+            sequence = unfinished / f"seq-{number:02d}"
+            sequence.mkdir(parents=True)
+            listed = f"sequence{number}\n" if frames else ""
+            (unfinished / f"{part}Split.txt").write_text(listed)
+            for i, frame in enumerate(frames):
+                _write_frame(str(sequence / f"frame-{i:06d}"), frame)
+        camera = (recording.train or recording.test)[0].camera
+        np.savetxt(unfinished / "camera-intrinsics.txt", camera.matrix())
+        return unfinished.rename(folder)
+
+    def real(self, name: str, recording: Recording) -> list[Case]:
+        """A real room with right intrinsics, with those of its file, and with wrong ones."""
+        room = REAL[name]
+        own = recording.train[0].camera
+        stated = {"": own}
+        if room.focal_px is not None:
+            stated = {"": own.zoomed(room.focal_px / own.fx), "-as-stated": own}
+        stated["-focal-long"] = stated[""].zoomed(STATED_LONG)
+        far = _with_blocks_left_out(recording, room.block)
+        name = f"{name}-far" if room.block else name
+        found = []
+        for more, camera in stated.items():
+            folder = self.write(f"{name}{more}", partial(_stated, far, camera))
+            found.append(Case("real", folder, (folder,), room.memory))
+        return found
+
+    def packaged(self, scene: Recording) -> list[Case]:
+        """A packaged room, and as a stabilised phone and a rolling shutter record it."""
+        folders = [self.write(scene.name, lambda: scene)]
+        for px in STABILISED_PX:
+            make = partial(_drawn, scene, partial(_with_moving_centre, px))
+            folders.append(self.write(f"stabilised-{scene.name}-{px:.0f}px", make))
+        make = partial(_drawn, scene, partial(_with_rolling_shutter, ROLLING_PX))
+        folders.append(self.write(f"rolling-{scene.name}-{ROLLING_PX:.0f}px", make))
+        return [Case("packaged", folder, (folder,)) for folder in folders]
+
+    def other_cameras(self, scene: Recording, memory: str = "10%") -> Case:
+        """Images of the recording's camera and of others, all stated as the recording's."""
+        middle = self.write(f"{scene.name}-middle", partial(_middle, scene))
+        folders = [middle]
+        for name, change in OTHERS.items():
+            make = partial(_other_camera, scene, change)
+            folders.append(self.write(f"{scene.name}-{name}", make))
+        return Case("another camera", middle, tuple(folders), memory)
+
+
+def prepared(folder: Path, real: Path | None) -> list[Case]:
+    """Prepare all recordings in a folder.
+
+    Args:
+        folder: One folder for each recording; those that exist are kept.
+        real: Folder of real recordings.
+    """
+    recordings = Prepared(folder)
+    found: list[Case] = []
+    scenes = [room.scene for room in sample_rooms()]
+    others = [(scene, "10%") for scene in scenes]
+    if real is not None:
+        rooms = {name: load_recording(real / name) for name in REAL}
+        for name, room in rooms.items():
+            found += recordings.real(name, room)
+        kitchen = rooms["redkitchen"]
+        # Half of the frames are enough for as many keyframes as 3 % of all.
+        others.append((replace(kitchen, train=kitchen.train[::2]), "6%"))
+    for scene in scenes:
+        found += recordings.packaged(scene)
+    return found + [recordings.other_cameras(*other) for other in others]
+
+
+def _write_frame(stem: str, frame: Frame) -> None:
+    assert frame.base_from_camera is not None
+    np.savetxt(f"{stem}.pose.txt", frame.base_from_camera.matrix())
+    if isinstance(frame.image, Path):
+        shutil.copyfile(frame.image, f"{stem}.color{frame.image.suffix}")
+    else:
+        write_image(f"{stem}.color.png", frame.read_image())
+
+
+def _stated(recording: Recording, camera: Camera) -> Recording:
+    train = _with_camera(recording.train, camera)
+    return replace(recording, train=train, test=_with_camera(recording.test, camera))
+
+
+def _with_camera(frames: Sequence[Frame], camera: Camera) -> tuple[Frame, ...]:
+    return tuple(replace(frame, camera=camera) for frame in frames)
+
+
+def _spread(frames: Sequence[Frame], count: int) -> tuple[Frame, ...]:
+    """Frames at equal steps, at most so many."""
+    steps = np.linspace(0, len(frames) - 1, min(count, len(frames)))
+    return tuple(frames[i] for i in steps.round().astype(int))
+
+
+def _with_blocks_left_out(recording: Recording, block: int) -> Recording:
+    """Leave out every second block of training frames; a part of them is located as well."""
+    train = posed_frames(recording.train)
+    test = posed_frames(recording.test)
+    if not block:
+        return replace(recording, train=train, test=_spread(test, TEST_IMAGES))
+    odd = np.arange(len(train)) // block % 2 == 1
+    left_out = [frame for frame, out in zip(train, odd, strict=True) if out]
+    kept = tuple(frame for frame, out in zip(train, odd, strict=True) if not out)
+    return replace(recording, train=kept, test=_spread([*test, *left_out], TEST_IMAGES))
+
+
+def _smooth_noise(count: int, channels: int, seed: int) -> np.ndarray:
+    """Gaussian noise (count, channels) of unit variance, smooth in time."""
+    margin = 4 * SMOOTH_FRAMES
+    white = np.random.default_rng(seed).normal(size=(count + 2 * margin, channels))
+    smooth = gaussian_filter1d(white, SMOOTH_FRAMES, axis=0)[margin : margin + count]
+    impulse = np.zeros(2 * margin + 1)
+    impulse[margin] = 1.0
+    return smooth / np.linalg.norm(gaussian_filter1d(impulse, SMOOTH_FRAMES))
+
+
+def _drawn(
+    scene: Recording, draw: Callable[[Sequence[Frame], int], tuple[Frame, ...]]
+) -> Recording:
+    """Draw the images of both parts with errors of their own."""
+    train = draw(posed_frames(scene.train), 0)
+    test = draw(posed_frames(scene.test), 1)
+    return replace(scene, train=train, test=test)
+
+
+def _pixels(camera: Camera) -> np.ndarray:
+    """Pixels (h, w, 2) of a camera."""
+    size = camera.width, camera.height
+    return np.stack(np.meshgrid(*map(np.arange, size)), -1).astype(float)
+
+
+def _resampled(frame: Frame, where: np.ndarray) -> Frame:
+    """A frame whose pixels come from elsewhere in its image (h, w, 2)."""
+    x, y = np.moveaxis(where.astype(np.float32), -1, 0)
+    border = cv2.BORDER_REPLICATE
+    image = cv2.remap(frame.read_image(), x, y, cv2.INTER_LINEAR, borderMode=border)
+    return replace(frame, image=np.asarray(image, np.uint8))
+
+
+def _with_moving_centre(
+    px: float, frames: Sequence[Frame], seed: int
+) -> tuple[Frame, ...]:
+    """As a stabilised phone: the principal point moves, the camera is turned to hide it."""
+    drawn = []
+    for frame, off in zip(
+        frames, px * _smooth_noise(len(frames), 2, seed), strict=True
+    ):
+        camera = frame.camera
+        moved = replace(camera, cx=camera.cx + off[0], cy=camera.cy + off[1])
+        centre = moved.unproject(np.array([camera.cx, camera.cy]))
+        centre /= np.linalg.norm(centre)
+        axis = np.cross(centre, [0.0, 0.0, 1.0])
+        angle = np.arcsin(np.linalg.norm(axis))
+        turn = SE3.exp([0.0, 0.0, 0.0, *(axis * angle / np.linalg.norm(axis))])
+        rays = turn.apply(moved.unproject(_pixels(camera)))
+        drawn.append(_resampled(frame, camera.project(rays)))
+    return tuple(drawn)
+
+
+def _with_rolling_shutter(
+    px: float, frames: Sequence[Frame], seed: int
+) -> tuple[Frame, ...]:
+    """As a rolling shutter of a camera that pans: rows are shifted in proportion to their place."""
+    pans = _smooth_noise(len(frames), 1, seed)[:, 0]
+    drawn = []
+    for frame, shift in zip(frames, px * pans / np.abs(pans).max(), strict=True):
+        where = _pixels(frame.camera)
+        middle = (frame.camera.height - 1) / 2
+        where[..., 0] += shift * (where[..., 1] - middle) / middle
+        drawn.append(_resampled(frame, where))
+    return tuple(drawn)
+
+
+def _middle(scene: Recording) -> Recording:
+    """The middle of all images, so that views of other cameras fit into them."""
+    train = tuple(seen(frame, np.zeros(4)) for frame in scene.train)
+    test = tuple(seen(frame, np.zeros(4)) for frame in _asked(scene))
+    return replace(scene, train=train, test=test)
+
+
+def _other_camera(scene: Recording, change: tuple[float, float, float]) -> Recording:
+    """Test images of another camera, see `OTHERS`, stated as the recording's."""
+    focal, x, y = change
+    test = []
+    for frame in _asked(scene):
+        own = seen(frame, np.zeros(4)).camera
+        width = frame.camera.width
+        other = seen(frame, np.array([focal, x / width, y / width, 0.0]))
+        test.append(replace(other, camera=own))
+    return replace(scene, train=(), test=tuple(test))
+
+
+def _asked(scene: Recording) -> tuple[Frame, ...]:
+    return _spread(posed_frames(scene.test), OTHER_IMAGES)
