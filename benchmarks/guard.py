@@ -6,6 +6,7 @@ Every build learns and locates the same recordings in a process of its own, by `
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -47,6 +48,9 @@ def run(
         beside: Commits to compare with.
         only: Part of the names of recordings that are learned.
         cache: Folder for recordings and the answers of every build.
+
+    Raises:
+        InputError: No such recording or commit, or a build fails.
     """
     if real is None:
         print("real rooms are left out: give their folder with --real")
@@ -55,8 +59,10 @@ def run(
         for case in prepared(cache.resolve() / "recordings", real)
         if only in case.learn.name
     ]
+    if not cases:
+        raise InputError(f"--only {only}: no recording has such a name")
     builds = {commit: source_of(commit, cache / "builds") / "src" for commit in beside}
-    builds[NOW] = ROOT / "src"
+    builds[NOW] = _kept(ROOT / "src", cache / "builds")
     measured = {name: _measured(cases, src, cache) for name, src in builds.items()}
     save(out, _compared(measured), {"beside": list(beside), "real": real is not None})
 
@@ -71,6 +77,14 @@ def _compared(measured: dict[str, list[Row]]) -> list[Row]:
         for name, old in olds.items():
             rows.append({"build": f"{NOW} - {name}", **_difference(old, now)})
     return rows
+
+
+def _kept(source: Path, builds: Path) -> Path:
+    """A copy of the working tree's build, which may change while it is measured."""
+    copy = builds.resolve() / fingerprint(source) / "src"
+    if not copy.exists():
+        shutil.copytree(source, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    return copy
 
 
 def fingerprint(source: Path) -> str:
@@ -121,7 +135,7 @@ def summary(answers: Sequence[Row]) -> Row:
     return {
         "n": count,
         "2_cm": 100 * float(((mm <= 20) & (deg <= 2)).mean()),
-        "1_cm": 100 * float((mm <= 10).mean()),
+        "1_cm": 100 * float(((mm <= 10) & (deg <= 1)).mean()),
         "mm": median_of(mm),
         "deg": median_of(deg),
         "refused": 100 * len(refused) / count,

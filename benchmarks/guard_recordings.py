@@ -32,7 +32,7 @@ SMOOTH_FRAMES = 3
 STATED_LONG = 1.02
 """Factor on the focal length where wrong intrinsics are stated."""
 STABILISED_PX = (3.0, 6.0)
-"""Standard deviations of a principal point that moves."""
+"""Root mean squares of the motion of a principal point, per axis."""
 ROLLING_PX = 2.0
 """Largest shift of the first and last row of an image against the middle one."""
 OTHERS = {"longer": (0.01, 0.0, 0.0), "shorter": (-0.005, 3.0, -2.0)}
@@ -196,13 +196,11 @@ def _with_blocks_left_out(recording: Recording, block: int) -> Recording:
 
 
 def _smooth_noise(count: int, channels: int, seed: int) -> np.ndarray:
-    """Gaussian noise (count, channels) of unit variance, smooth in time."""
+    """Noise (count, channels) that is smooth in time, with a mean square of 1."""
     margin = 4 * SMOOTH_FRAMES
     white = np.random.default_rng(seed).normal(size=(count + 2 * margin, channels))
     smooth = gaussian_filter1d(white, SMOOTH_FRAMES, axis=0)[margin : margin + count]
-    impulse = np.zeros(2 * margin + 1)
-    impulse[margin] = 1.0
-    return smooth / np.linalg.norm(gaussian_filter1d(impulse, SMOOTH_FRAMES))
+    return smooth / np.sqrt((smooth**2).mean(0))
 
 
 def _drawn(
