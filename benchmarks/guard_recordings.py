@@ -52,8 +52,8 @@ class RealRoom:
 
 
 REAL = {
-    "tsdf_room": RealRoom("10%", 25, 515.0),
-    "redkitchen": RealRoom("3%", 50),
+    "tsdf_room": RealRoom("10%", 50, 515.0),
+    "redkitchen": RealRoom("3%", 100),
     "fr1_rpy": RealRoom("3%"),
 }
 """Real rooms. The file of tsdf_room states the focal length of its depth camera."""
