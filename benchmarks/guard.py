@@ -17,7 +17,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.accuracy import wrong
-from benchmarks.guard_recordings import Case, prepared
+from benchmarks.guard_recordings import Case, all_cases, write
 from benchmarks.rows import Row, grouped, median_of, numbers, once, save
 from benchmarks.same_answers import ROOT, source_of
 from evercal.errors import InputError
@@ -54,11 +54,8 @@ def run(
     """
     if real is None:
         print("real rooms are left out: give their folder with --real")
-    cases = [
-        case
-        for case in prepared(cache.resolve() / "recordings", real)
-        if only in case.learn.name
-    ]
+    listed = all_cases(real, cache.resolve() / "rendered")
+    cases = [case for case in listed if only in case.learned]
     if not cases:
         raise InputError(f"--only {only}: no recording has such a name")
     builds = {commit: source_of(commit, cache / "builds") / "src" for commit in beside}
@@ -101,26 +98,30 @@ def _measured(cases: Sequence[Case], source: Path, cache: Path) -> list[Row]:
     kept = cache.resolve() / "answers" / fingerprint(source)
     rows = []
     for case in tqdm(cases, source.parent.name, unit="map"):
-        file = kept / f"{case.learn.name}.json"
-        images = once(file, partial(_answers, case, source))
+        measure = partial(_answers, case, source, cache.resolve() / "recordings")
+        images = once(kept / f"{case.learned}.json", measure)
         for (name,), of in grouped(images, "recording").items():
             what: Row = {"suite": case.suite, "recording": name}
             rows.append(what | summary(of))
     return rows
 
 
-def _answers(case: Case, source: Path) -> list[Row]:
+def _answers(case: Case, source: Path, folder: Path) -> list[Row]:
     """Answers of a build, in a process of its own."""
+    for name, make in case.make.items():
+        if not (folder / name).exists():
+            write(folder / name, make())
     script = str(ROOT / "benchmarks" / "guard_answers.py")
     done = subprocess.run(
-        [sys.executable, "-P", script, case.learn, case.memory, *case.ask],
+        [sys.executable, "-P", script, case.memory, *case.make],
+        cwd=folder,
         env={**os.environ, "PYTHONPATH": str(source)},
         capture_output=True,
         text=True,
         check=False,
     )
     if done.returncode:
-        raise InputError(f"{case.learn}: {done.stderr.strip()[-2000:]}")
+        raise InputError(f"{case.learned}: {done.stderr.strip()[-2000:]}")
     return json.loads(done.stdout)
 
 

@@ -15,13 +15,12 @@ from evercal.map import Map
 from evercal.recordings import Frame, load_recording, posed_frames
 
 
-def answers(learn: str, memory: str, *ask: str) -> list[dict[str, object]]:
-    """Learn one recording and locate the test frames of others.
+def answers(memory: str, *recordings: str) -> list[dict[str, object]]:
+    """Learn the first of some recordings and locate the test frames of all.
 
     Args:
-        learn: Folder of the recording.
         memory: Keyframes that are kept.
-        ask: Folders of the others.
+        recordings: Their folders.
 
     Returns:
         A row for each image, with CPU seconds.
@@ -30,12 +29,12 @@ def answers(learn: str, memory: str, *ask: str) -> list[dict[str, object]]:
     with tempfile.TemporaryDirectory() as scratch:
         learned = Map.open(Path(scratch) / "map")
         start = time.process_time()
-        learned.learn(learn, memory=memory, on_progress=_silent)
+        learned.learn(recordings[0], memory=memory, on_progress=_silent)
         seconds = time.process_time() - start
-        for folder in map(Path, ask):
-            for frame in posed_frames(load_recording(folder).test):
-                row = {"recording": folder.name, "image": frame.name}
-                rows.append(row | {"learn_s": seconds} | _answer(learned, frame))
+        for name in recordings:
+            for frame in posed_frames(load_recording(name).test):
+                row = {"recording": name, "image": frame.name, "learn_s": seconds}
+                rows.append(row | _answer(learned, frame))
     return rows
 
 

@@ -6,7 +6,7 @@ the recording's.
 """
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from benchmarks.guard_far import ROOMS, far_room
 from benchmarks.same_model import seen
 from evercal.geometry import SE3, Camera
 from evercal.recordings import load_recording, posed_frames, write_image
@@ -59,104 +60,101 @@ REAL = {
 """Real rooms. The file of tsdf_room states the focal length of its depth camera."""
 
 
+Make = Callable[[], Recording]
+"""Makes a recording."""
+
+
 @dataclass(frozen=True)
 class Case:
-    """A recording to learn, and those whose test images are located in it."""
+    """Recordings that are located in a map of the first one."""
 
     suite: str
     """Name of its suite."""
-    learn: Path
-    """Folder of the recording."""
-    ask: tuple[Path, ...]
-    """Folders."""
+    make: Mapping[str, Make]
+    """Recordings by name."""
     memory: str = "10%"
     """Keyframes that are kept."""
 
-
-@dataclass(frozen=True)
-class Prepared:
-    """A folder of recordings; those that exist are kept."""
-
-    folder: Path
-    """One folder for each recording."""
-
-    def write(self, name: str, make: Callable[[], Recording]) -> Path:
-        """Write a recording of one camera as a 7-Scenes folder, whole or not at all."""
-        folder = self.folder / name
-        if folder.exists():
-            return folder
-        recording = make()
-        unfinished = folder.with_name(f"{name}.unfinished")
-        shutil.rmtree(unfinished, ignore_errors=True)
-        parts = (("Train", recording.train), ("Test", recording.test))
-        for number, (part, frames) in enumerate(parts, start=1):
-            sequence = unfinished / f"seq-{number:02d}"
-            sequence.mkdir(parents=True)
-            listed = f"sequence{number}\n" if frames else ""
-            (unfinished / f"{part}Split.txt").write_text(listed)
-            for i, frame in enumerate(frames):
-                _write_frame(str(sequence / f"frame-{i:06d}"), frame)
-        camera = (recording.train or recording.test)[0].camera
-        np.savetxt(unfinished / "camera-intrinsics.txt", camera.matrix())
-        return unfinished.rename(folder)
-
-    def real(self, name: str, recording: Recording) -> list[Case]:
-        """A real room with right intrinsics, with those of its file, and with wrong ones."""
-        room = REAL[name]
-        own = recording.train[0].camera
-        stated = {"": own}
-        if room.focal_px is not None:
-            stated = {"": own.zoomed(room.focal_px / own.fx), "-as-stated": own}
-        stated["-focal-long"] = stated[""].zoomed(STATED_LONG)
-        far = _with_blocks_left_out(recording, room.block)
-        name = f"{name}-far" if room.block else name
-        found = []
-        for more, camera in stated.items():
-            folder = self.write(f"{name}{more}", partial(_stated, far, camera))
-            found.append(Case("real", folder, (folder,), room.memory))
-        return found
-
-    def packaged(self, scene: Recording) -> list[Case]:
-        """A packaged room, and as a stabilised phone and a rolling shutter record it."""
-        folders = [self.write(scene.name, lambda: scene)]
-        for px in STABILISED_PX:
-            make = partial(_drawn, scene, partial(_with_moving_centre, px))
-            folders.append(self.write(f"stabilised-{scene.name}-{px:.0f}px", make))
-        make = partial(_drawn, scene, partial(_with_rolling_shutter, ROLLING_PX))
-        folders.append(self.write(f"rolling-{scene.name}-{ROLLING_PX:.0f}px", make))
-        return [Case("packaged", folder, (folder,)) for folder in folders]
-
-    def other_cameras(self, scene: Recording, memory: str = "10%") -> Case:
-        """Images of the recording's camera and of others, all stated as the recording's."""
-        middle = self.write(f"{scene.name}-middle", partial(_middle, scene))
-        folders = [middle]
-        for name, change in OTHERS.items():
-            make = partial(_other_camera, scene, change)
-            folders.append(self.write(f"{scene.name}-{name}", make))
-        return Case("another camera", middle, tuple(folders), memory)
+    @property
+    def learned(self) -> str:
+        """Name of the recording that is learned."""
+        return next(iter(self.make))
 
 
-def prepared(folder: Path, real: Path | None) -> list[Case]:
-    """Prepare all recordings in a folder.
+def all_cases(real: Path | None, rendered: Path) -> Iterator[Case]:
+    """List what is measured.
 
     Args:
-        folder: One folder for each recording; those that exist are kept.
         real: Folder of real recordings.
+        rendered: Folder for images of rendered rooms.
     """
-    recordings = Prepared(folder)
-    found: list[Case] = []
     scenes = [room.scene for room in sample_rooms()]
     others = [(scene, "10%") for scene in scenes]
     if real is not None:
-        rooms = {name: load_recording(real / name) for name in REAL}
-        for name, room in rooms.items():
-            found += recordings.real(name, room)
-        kitchen = rooms["redkitchen"]
+        for name in REAL:
+            yield from _real(name, load_recording(real / name))
+        kitchen = load_recording(real / "redkitchen")
         # Half of the frames are enough for as many keyframes as 3 % of all.
         others.append((replace(kitchen, train=kitchen.train[::2]), "6%"))
     for scene in scenes:
-        found += recordings.packaged(scene)
-    return found + [recordings.other_cameras(*other) for other in others]
+        yield from _packaged(scene)
+    for scene, memory in others:
+        yield _other_cameras(scene, memory)
+    for kind in ROOMS:
+        make = partial(far_room, kind, rendered)
+        yield Case("far views", {f"far-{kind}": make}, "20%")
+
+
+def _real(name: str, recording: Recording) -> Iterator[Case]:
+    """A real room with right intrinsics, with those of its file, and with wrong ones."""
+    room = REAL[name]
+    own = recording.train[0].camera
+    stated = {"": own}
+    if room.focal_px is not None:
+        stated = {"": own.zoomed(room.focal_px / own.fx), "-as-stated": own}
+    stated["-focal-long"] = stated[""].zoomed(STATED_LONG)
+    far = _with_blocks_left_out(recording, room.block)
+    name = f"{name}-far" if room.block else name
+    for more, camera in stated.items():
+        make = partial(_stated, far, camera)
+        yield Case("real", {f"{name}{more}": make}, room.memory)
+
+
+def _packaged(scene: Recording) -> Iterator[Case]:
+    """A packaged room, and as a stabilised phone and a rolling shutter record it."""
+    drawn: dict[str, Make] = {scene.name: lambda: scene}
+    for px in STABILISED_PX:
+        draw = partial(_with_moving_centre, px)
+        drawn[f"stabilised-{scene.name}-{px:.0f}px"] = partial(_drawn, scene, draw)
+    draw = partial(_with_rolling_shutter, ROLLING_PX)
+    drawn[f"rolling-{scene.name}-{ROLLING_PX:.0f}px"] = partial(_drawn, scene, draw)
+    for name, make in drawn.items():
+        yield Case("packaged", {name: make})
+
+
+def _other_cameras(scene: Recording, memory: str) -> Case:
+    """Images of the recording's camera and of others, all stated as the recording's."""
+    make: dict[str, Make] = {f"{scene.name}-middle": partial(_middle, scene)}
+    for name, change in OTHERS.items():
+        make[f"{scene.name}-{name}"] = partial(_other_camera, scene, change)
+    return Case("another camera", make, memory)
+
+
+def write(folder: Path, recording: Recording) -> None:
+    """Write a recording of one camera as a 7-Scenes folder, whole or not at all."""
+    unfinished = folder.with_name(f"{folder.name}.unfinished")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    parts = (("Train", recording.train), ("Test", recording.test))
+    for number, (part, frames) in enumerate(parts, start=1):
+        sequence = unfinished / f"seq-{number:02d}"
+        sequence.mkdir(parents=True)
+        listed = f"sequence{number}\n" if frames else ""
+        (unfinished / f"{part}Split.txt").write_text(listed)
+        for i, frame in enumerate(frames):
+            _write_frame(str(sequence / f"frame-{i:06d}"), frame)
+    camera = (recording.train or recording.test)[0].camera
+    np.savetxt(unfinished / "camera-intrinsics.txt", camera.matrix())
+    unfinished.rename(folder)
 
 
 def _write_frame(stem: str, frame: Frame) -> None:

@@ -49,7 +49,7 @@ def sweep_shots(room: Room, frames: int, seed: int) -> list[Shot]:
         InputError: The room has no free path.
     """
     train_count = max(1, round(0.7 * frames))
-    train = _free_path(room, train_count, [seed, 1])
+    train = free_path(room, train_count, [seed, 1])
     test = _far_from(room, frames - train_count, train, [seed, 9])
     arm_train = _arm_path(train_count, [seed, 2], hold=12)
     arm_test = _arm_path(frames - train_count, [seed, 3], hold=12)
@@ -95,7 +95,7 @@ def fixed_shots(room: Room, frames: int, seed: int) -> FixedShots:
     The bump is 5 mm in a random direction for even seeds, 0.5 deg about a random axis for odd ones.
     """
     rng = np.random.default_rng([seed, 4])
-    pose = _free_path(room, 200, [seed, 5])[int(rng.integers(200))]
+    pose = free_path(room, 200, [seed, 5])[int(rng.integers(200))]
     direction = rng.standard_normal(3)
     direction /= np.linalg.norm(direction)
     tangent = np.zeros(6)
@@ -150,7 +150,7 @@ def _arm_path(
     return HOME_RAD + spread * wave
 
 
-def _free_path(room: Room, frames: int, seed: list[int]) -> SE3:
+def free_path(room: Room, frames: int, seed: list[int]) -> SE3:
     """A sweep that avoids all objects, shape (frames,)."""
     for attempt in range(300):
         path = _sweep(frames, np.random.default_rng([*seed, room.seed, attempt]))
@@ -199,7 +199,7 @@ def _far_from(room: Room, frames: int, train: SE3, seed: list[int]) -> SE3:
         return SE3.stack([])
     for density in (1.0, 1.15, 1.3, 1.6, 2.0, 3.0):
         for attempt in range(4):
-            path = _free_path(room, int(np.ceil(frames * density)), [*seed, attempt])
+            path = free_path(room, int(np.ceil(frames * density)), [*seed, attempt])
             metres, radians = pose_distance(path[:, None], train[None])
             too_near = ((metres < TOO_NEAR_M) & (radians < TOO_NEAR_RAD)).any(1)
             near = ((metres < NEAR_M) & (radians < NEAR_RAD)).any(1)
