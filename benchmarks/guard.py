@@ -9,7 +9,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -20,14 +20,12 @@ from benchmarks.accuracy import wrong
 from benchmarks.guard_recordings import Case, all_cases, write
 from benchmarks.rows import Row, grouped, median_of, numbers, once, save
 from benchmarks.same_answers import ROOT, source_of
+from benchmarks.same_model import INSIDE_95
 from evercal.errors import InputError
+from evercal.evaluation.metrics import share_inside
 
 NOW = "now"
 """Name of the working tree's build."""
-POSITION_95 = 7.815
-"""95 % quantile of a squared deviation in three dimensions (chi-squared)."""
-POSE_95 = 12.592
-"""95 % quantile in six dimensions."""
 
 
 def run(
@@ -60,20 +58,23 @@ def run(
         raise InputError(f"--only {only}: no recording has such a name")
     builds = {commit: source_of(commit, cache / "builds") / "src" for commit in beside}
     builds[NOW] = _kept(ROOT / "src", cache / "builds")
-    measured = {name: _measured(cases, src, cache) for name, src in builds.items()}
-    save(out, _compared(measured), {"beside": list(beside), "real": real is not None})
-
-
-def _compared(measured: dict[str, list[Row]]) -> list[Row]:
-    """Rows of all builds, by recording, with the differences of this build to others."""
     rows: list[Row] = []
-    for number, now in enumerate(measured[NOW]):
-        olds = {name: of[number] for name, of in measured.items() if name != NOW}
-        rows += [{"build": name, **old} for name, old in olds.items()]
-        rows.append({"build": NOW, **now})
-        for name, old in olds.items():
-            rows.append({"build": f"{NOW} - {name}", **_difference(old, now)})
-    return rows
+    for case in tqdm(cases, unit="map"):
+        # Builds take turns, so that their CPU times are those of the same hour.
+        measured = {name: _measured(case, src, cache) for name, src in builds.items()}
+        rows += _compared(measured)
+    save(out, rows, {"beside": list(beside), "real": real is not None})
+
+
+def _compared(measured: dict[str, list[Row]]) -> Iterator[Row]:
+    """Rows of all builds, by recording, with the differences of this build to others."""
+    for row in zip(*measured.values(), strict=True):
+        of_build = dict(zip(measured, row, strict=True))
+        for name, of in of_build.items():
+            yield {"build": name, **of}
+        now = of_build.pop(NOW)
+        for name, old in of_build.items():
+            yield {"build": f"{NOW} - {name}", **_difference(old, now)}
 
 
 def _kept(source: Path, builds: Path) -> Path:
@@ -93,16 +94,14 @@ def fingerprint(source: Path) -> str:
     return total.hexdigest()[:12]
 
 
-def _measured(cases: Sequence[Case], source: Path, cache: Path) -> list[Row]:
+def _measured(case: Case, source: Path, cache: Path) -> list[Row]:
     """Rows of a build, one for each recording that is located."""
     kept = cache.resolve() / "answers" / fingerprint(source)
+    measure = partial(_answers, case, source, cache.resolve() / "recordings")
     rows = []
-    for case in tqdm(cases, source.parent.name, unit="map"):
-        measure = partial(_answers, case, source, cache.resolve() / "recordings")
-        images = once(kept / f"{case.learned}.json", measure)
-        for (name,), of in grouped(images, "recording").items():
-            what: Row = {"suite": case.suite, "recording": name}
-            rows.append(what | summary(of))
+    images = once(kept / f"{case.learned}.json", measure)
+    for (name,), of in grouped(images, "recording").items():
+        rows.append({"suite": case.suite, "recording": name, **summary(of)})
     return rows
 
 
@@ -140,8 +139,8 @@ def summary(answers: Sequence[Row]) -> Row:
         "mm": median_of(mm),
         "deg": median_of(deg),
         "refused": 100 * len(refused) / count,
-        "inside_position": 100 * float((position <= POSITION_95).mean()),
-        "inside_pose": 100 * float((numbers(answers, "pose") <= POSE_95).mean()),
+        "inside_position": 100 * float((position <= INSIDE_95).mean()),
+        "inside_pose": share_inside(numbers(answers, "pose")),
         "wrong": int(wrong(located, position).sum()),
         "learn_s": float(answers[0]["learn_s"]),
         "ask_s": float(numbers(answers, "ask_s").sum()),
@@ -149,11 +148,10 @@ def summary(answers: Sequence[Row]) -> Row:
 
 
 def _difference(old: Row, now: Row) -> Row:
-    row: Row = {}
+    """The numbers of a build less those of an older one."""
+    row: Row = dict(now)
     for key, value in now.items():
         before = old[key]
-        if isinstance(value, str) or isinstance(before, str) or key == "n":
-            row[key] = value
-        else:
+        if not isinstance(value, str) and not isinstance(before, str):
             row[key] = value - before
     return row

@@ -14,16 +14,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
 
 from benchmarks.guard_far import ROOMS, far_room
 from benchmarks.same_model import seen
-from evercal.geometry import SE3, Camera
+from evercal.geometry import Camera
 from evercal.recordings import load_recording, posed_frames, write_image
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.samples import sample_rooms
 
-Image = np.ndarray
-"""uint8, shape (h, w, 3)."""
 TEST_IMAGES = 60
 """Images of a recording that are located, at most."""
 OTHER_IMAGES = 39
@@ -235,11 +234,8 @@ def _with_moving_centre(
         camera = frame.camera
         moved = replace(camera, cx=camera.cx + off[0], cy=camera.cy + off[1])
         centre = moved.unproject(np.array([camera.cx, camera.cy]))
-        centre /= np.linalg.norm(centre)
-        axis = np.cross(centre, [0.0, 0.0, 1.0])
-        angle = np.arcsin(np.linalg.norm(axis))
-        turn = SE3.exp([0.0, 0.0, 0.0, *(axis * angle / np.linalg.norm(axis))])
-        rays = turn.apply(moved.unproject(_pixels(camera)))
+        turn = Rotation.align_vectors([0.0, 0.0, 1.0], centre)[0]
+        rays = moved.unproject(_pixels(camera)) @ turn.as_matrix().T
         drawn.append(_resampled(frame, camera.project(rays)))
     return tuple(drawn)
 
