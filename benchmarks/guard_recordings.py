@@ -52,7 +52,7 @@ class RealRoom:
 
 
 REAL = {
-    "tsdf_room": RealRoom("10%", 50, 515.0),
+    "tsdf_room": RealRoom("10%", 25, 512.0),
     "redkitchen": RealRoom("3%", 100),
     "fr1_rpy": RealRoom("3%"),
 }
