@@ -32,6 +32,7 @@ VERBS = {
     ),
     "guard": ("guard", "real rooms, far views, cameras not as stated; beside a commit"),
     "same-model": ("same_model", "images of other cameras of the recording's model"),
+    "warps": ("warps", "images that no camera in the room makes"),
     "handeye": ("hand_eye", "pose pairs: errors, ellipsoids, outliers, scale, time"),
     "boards": ("boards", "detection of rendered boards, beside the finders of OpenCV"),
     "handeye-boards": ("hand_eye_boards", "boards and intrinsics from the same images"),

@@ -9,6 +9,7 @@ from evercal.geometry import SE3, UncertainPose, pose_distance, pose_distance_mm
 from evercal.localization import acceptance
 from evercal.localization.estimate import CovarianceTerm, PoseEstimate
 from evercal.localization.hypothesis import Aligned, Hypothesis, accepted
+from evercal.localization.lack_of_fit import WARPED, LackOfFit, lack_of_fit
 from evercal.mapping.scene_map import SceneMap
 from evercal.typing import Array
 
@@ -37,13 +38,16 @@ def differ(hypothesis: Hypothesis, other: SE3) -> bool:
 
 
 def in_base(
-    hypothesis: Hypothesis, scene: SceneMap
+    hypothesis: Hypothesis, scene: SceneMap, misfit: LackOfFit | None = None
 ) -> tuple[UncertainPose, tuple[CovarianceTerm, ...]]:
     """The answer in the base frame, and the shares of its covariance."""
     frame = scene.frame
     factor = widening(hypothesis)
     pose = hypothesis.pose
-    wide = UncertainPose(pose.pose, factor * pose.covariance)
+    covariance = factor * pose.covariance
+    if misfit is not None:
+        covariance = covariance + misfit.covariance
+    wide = UncertainPose(pose.pose, covariance)
     estimate = frame.to_base(wide)
     if not isinstance(hypothesis, Aligned):
         return estimate, ()
@@ -76,10 +80,11 @@ def answer(
     size: tuple[int, ...],
     milliseconds: float,
     rival: Hypothesis | None = None,
+    mirrored: float = 0.0,
 ) -> PoseEstimate:
     """The answer for a pose in the map's frame, with another one that fits as well.
 
-    `size` are height and width of the image.
+    `size` are height and width of the image; `mirrored` is the support of its mirror image.
     """
     if best is None:
         return PoseEstimate.failed("fewer than 6 inliers", milliseconds)
@@ -96,7 +101,8 @@ def answer(
     )
     if not accepted(best):
         return replace(rejected, reason=rejection(best, scene))
-    estimate, terms = in_base(best, scene)
+    misfit = _misfit(best)
+    estimate, terms = in_base(best, scene, misfit)
     rejected = replace(rejected, parent_frame=scene.parent_frame)
     if rival is not None:
         other = scene.frame.to_base(rival.pose).pose
@@ -108,8 +114,8 @@ def answer(
             alternatives=(estimate.pose, other),
         )
     position_m = estimate.sigma_mm / 1000
-    if scene.at_room_scale(position_m) > acceptance.USELESS_M:
-        reason = _uncertain_reason(position_m, scene)
+    reason = _useless(best, misfit, position_m, mirrored, scene)
+    if reason:
         return replace(rejected, status="uncertain", reason=reason, scene=scene.name)
     camera = None
     if isinstance(best, Aligned):
@@ -134,6 +140,37 @@ def _rival_reason(pose: SE3, other: SE3, scene: SceneMap) -> str:
     if scene.metric:
         away = f"{mm:.0f} mm, {away}"
     return f"ambiguous: a second pose {away} fits equally well"
+
+
+def _misfit(best: Hypothesis) -> LackOfFit | None:
+    """Lack of fit of an aligned pose, if it is significant."""
+    if not isinstance(best, Aligned):
+        return None
+    pose = best.pose.pose
+    return lack_of_fit(best.observed, best.camera, pose, best.change)
+
+
+def _useless(
+    best: Hypothesis,
+    misfit: LackOfFit | None,
+    position: float,
+    mirrored: float,
+    scene: SceneMap,
+) -> str:
+    """Why an accepted pose is of no use; empty where it is of use."""
+    if mirrored > best.support:
+        return (
+            f"the image is mirrored: its mirror image has support {mirrored:.1f},"
+            f" the image {best.support:.1f}"
+        )
+    if misfit is not None and misfit.size * math.sqrt(widening(best)) > WARPED:
+        return misfit.reason
+    if scene.at_room_scale(position) <= acceptance.USELESS_M:
+        return ""
+    reason = _uncertain_reason(position, scene)
+    if misfit is not None:
+        return f"{reason}: {misfit.reason}"
+    return reason
 
 
 def _uncertain_reason(position: float, scene: SceneMap) -> str:

@@ -29,9 +29,9 @@ class PoseEstimate:
     """The answer for one image; failure is a value, not an exception."""
 
     status: Status
-    """`uncertain`: the scene is known, the pose is too uncertain to be useful. `ambiguous`: two
-    poses explain the image, see `alternatives`. `unknown_scene`: no pose has enough support.
-    `failed`: no pose."""
+    """`uncertain`: the scene is known, but the pose is too uncertain to be useful, or the image is
+    not as a camera took it. `ambiguous`: two poses explain the image, see `alternatives`.
+    `unknown_scene`: no pose has enough support. `failed`: no pose."""
     reason: str
     """Why the status is not `ok`; empty otherwise."""
     scene: str | None

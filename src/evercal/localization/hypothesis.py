@@ -9,6 +9,7 @@ import numpy as np
 
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.localization import acceptance
+from evercal.localization.pose_refinement import Observed
 from evercal.localization.query import Candidate
 from evercal.typing import Array
 
@@ -88,6 +89,8 @@ class Aligned(Hypothesis):
     """(5,) change of the intrinsics, see `Camera.changed`."""
     by_intrinsics: Array
     """(6, 6) share of the pose's covariance that is due to the intrinsics."""
+    observed: Observed
+    """Matched landmarks, in pixels of `Query.grey`."""
     matches: Matches = NO_MATCHES
     """All matches of the PnP pose."""
 

@@ -98,11 +98,14 @@ class Localizer:
         query = replace(query, encoded=Encoded(features))
         best = self._best_hypothesis(query)
         rival = None
+        mirrored = 0.0
         if isinstance(best, Aligned) and accepted(best):
             best, rival = settled(self.poses, query, best)
+            if not accepted(best, self.options.immediate):
+                mirrored = self._mirrored_support(query)
         milliseconds = 1000 * (time.perf_counter() - began)
         scene = contents.scenes[0 if best is None else best.scene]
-        estimate = answer(best, scene, image.shape[:2], milliseconds, rival)
+        estimate = answer(best, scene, image.shape[:2], milliseconds, rival, mirrored)
         return estimate, best
 
     def query(self, image: Image, camera: Camera | None) -> Query:
@@ -145,6 +148,23 @@ class Localizer:
             if accepted(best, options.immediate):
                 break
         return best
+
+    def _mirrored_support(self, query: Query) -> float:
+        """Support of the mirror image, by the first attempt."""
+        contents = self.contents
+        image = np.ascontiguousarray(query.image[:, ::-1])
+        cameras = []
+        for camera in query.cameras:
+            cameras.append(replace(camera, cx=camera.width - 1 - camera.cx))
+        encoded = Encoded(contents.encoder.encode(image, contents.short_side))
+        query = Query(image, query.short_side, cameras, query.priors, encoded)
+        first = self.options.attempts[0]
+        best = self._tried(query, first)
+        if self._inliers(best) == "few inliers":
+            upright = self.poses.matcher.upright(query)
+            if upright.turns:
+                best = self._tried(replace(query, encoded=upright), first)
+        return order(best)[0]
 
     def _inliers(self, best: Hypothesis | None) -> str:
         """Whether PnP has many inliers, in the words of `Attempt.when`."""

@@ -160,7 +160,7 @@ def minimise(
             observed.pixels, observed.points_m, rotation, position, now, free > 0
         )
         raw += (moved - change)[:free] @ slope[6:].transpose(1, 0, 2)
-        residual, slope = _whitened(observed.whitening, raw, slope)
+        residual, slope = whitened(observed.whitening, raw, slope)
         squares = residual[0] * residual[0] + residual[1] * residual[1]
         variance = robust_variance(squares)
         if best is not None and variance > _DIVERGED * best.variance:
@@ -205,7 +205,7 @@ def _stepped(change: Array, step: Array) -> Array:
     return stepped
 
 
-def _whitened(white: Array, errors: Array, slope: Array) -> tuple[Array, Array]:
+def whitened(white: Array, errors: Array, slope: Array) -> tuple[Array, Array]:
     """Errors (2, n) and their derivatives (k, 2, n), whitened by (2, 2, n)."""
     residual = white[:, 0] * errors[0] + white[:, 1] * errors[1]
     by_x = white[None, :, 0] * slope[:, 0, None]

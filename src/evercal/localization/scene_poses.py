@@ -151,6 +151,7 @@ class ScenePoses:
             camera=refined.camera,
             change=refined.change,
             by_intrinsics=refined.by_intrinsics,
+            observed=observed,
         )
 
     def slips(self, aligned: Aligned) -> Array:
