@@ -107,8 +107,8 @@ MISTAKES: dict[str, Mistake] = {
     "drift 1 % of the path": Mistake(_drift, _SMOOTH),
     "one axis scaled 5 %": Mistake(_scaled((1.05, 1, 1)), f"{_SMOOTH}|scale"),
     "base jumped 50 mm": Mistake(_bumped_base, f"{_SMOOTH}|jump"),
-    "poses 3 frames late": Mistake(_late(3), "lag|late|frame intervals"),
-    "poses 3 frames early": Mistake(_late(-3), "lag|early|frame intervals"),
+    "poses 3 frames late": Mistake(_late(3), "clocks"),
+    "poses 3 frames early": Mistake(_late(-3), "clocks"),
     "a third wrong": Mistake(_jumps(1 / 3), _MANY),
     "half wrong": Mistake(_jumps(1 / 2), _MANY),
     "inches as metres": Mistake(_scaled((1 / 0.0254,) * 3), "unit|inch"),
@@ -169,8 +169,8 @@ def _answers(cell: Map, recording: Recording, change: Change) -> Row:
         "located": len(errors),
         "lies": _lies(errors),
         "lies_stated": _lies(stated),
-        "mm": median_of(numbers(errors, "mm")),
-        "sigma_mm": median_of(numbers(errors, "sigma_mm")),
+        "mm": median_of(numbers(errors, "mm")) if errors else 0.0,
+        "sigma_mm": median_of(numbers(errors, "sigma_mm")) if errors else 0.0,
     }
 
 

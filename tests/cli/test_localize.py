@@ -84,7 +84,7 @@ def test_several_images_end_with_one_line_about_all(run, hall_store, images):
     sd = f"standard deviation {1000 * np.sqrt(mean):.2f} mm per axis (median)"
     words = unknown["status"].replace("_", " ")
     lines = run("localize", hall_store, images).out.splitlines()
-    assert lines[-2] == f"1 of 2 images located, in hall 1; {sd}; refused: {words} 1"
+    assert lines[-2] == f"1 of 2 images located, in hall 1; refused: {words} 1; {sd}"
     (black,) = sorted(images.iterdir())[1:]
     assert "located" not in run("localize", hall_store, black).out
 

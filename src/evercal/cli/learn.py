@@ -6,28 +6,25 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
 from evercal.choices import Preset
 from evercal.cli import args
 from evercal.cli.calibrate import joint_lines
-from evercal.cli.console import numbers, require_writable, say, say_notes, size
+from evercal.cli.console import require_writable, say, say_notes, size
 from evercal.cli.info import adjusted_row
 from evercal.errors import InputError
 from evercal.progress import Bars
 
 if TYPE_CHECKING:
     from evercal.learning.report import LearnReport
-    from evercal.mapping.built_map import Adjusted
     from evercal.recordings import Recording
 
 FEW_LANDMARKS = 50
 """Landmarks a keyframe; of a dark, overexposed or blurred room with 9, 21, 58 and 83 of them, 50,
 60, 100 and 90 % of the images were located."""
-MOST_CORNER_PX = 3.0
-"""Change of the corners of the image by adjusted intrinsics, pixels."""
 
 
 @dataclass(frozen=True)
@@ -296,6 +293,7 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
         if report.landmarks < FEW_LANDMARKS * report.frames_kept:
             few = f"{report.landmarks / report.frames_kept:.0f} landmarks a keyframe are few"
             yield f"warning: {few}: most images will be refused; record sharper and textured views"
+    yield from map("warning: {}".format, report.warnings)
     found = report.hand_eye
     if found is not None:
         pose = found.parent_from_camera
@@ -316,44 +314,7 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
     if report.adjusted is not None:
         row = adjusted_row(report.scene, dataclasses.asdict(report.adjusted))
         yield "; ".join(map("{} {}".format, row, row.values()))
-        yield from _warnings(report.adjusted)
-
-
-def _warnings(adjusted: "Adjusted") -> Iterator[str]:
-    from evercal.calibration.from_map.hand_eye import MOST_FOCAL_PERCENT
-
-    if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
-        yield (
-            "warning: images and stated poses ask for a focal length"
-            f" {adjusted.focal_percent:+.1f} % from the stated one; the intrinsics or the scale of"
-            " the poses are wrong"
-        )
-    if adjusted.corner_px > MOST_CORNER_PX:
-        stated, now = map(_intrinsics, adjusted.intrinsics)
-        yield (
-            f"warning: the images move the corners of the image by {adjusted.corner_px:.1f} px: fx,"
-            f" fy, cx, cy and distortion are stated as {stated}, adjusted {now}; check the camera"
-            " file"
-        )
-    if abs(adjusted.time_shift_frames) > 0.02:
-        yield (
-            f"warning: the images lag their stated poses by {adjusted.time_shift_frames:+.2f} frame"
-            " intervals; check the clocks"
-        )
-    for what, names in (
-        ("warning: poses that contradict the images, left out", adjusted.wrong_poses),
-        ("untracked images, left out", adjusted.untracked),
-        ("warning: poses with large errors", adjusted.doubtful_poses),
-    ):
-        if names:
+        if report.adjusted.untracked:
             from evercal.storage.text_files import few
 
-            yield f"{what}: {few(names, most=8)}"
-
-
-def _intrinsics(record: dict[str, Any]) -> str:
-    from evercal.geometry import Camera
-
-    camera = Camera.from_dict(record)
-    pinhole = (camera.fx, camera.fy, camera.cx, camera.cy)
-    return numbers((*pinhole, *camera.distortion), ".5g")
+            yield f"untracked images, left out: {few(report.adjusted.untracked, most=8)}"

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Annotated
 
 from evercal.cli import args
@@ -190,31 +191,25 @@ def _lines(answer: Answer, point: args.Point | None) -> Iterator[str]:
 
 def _summary(answers: list[Answer]) -> Iterator[str]:
     """One line about several images: located where and how exactly, refused why."""
-    from statistics import median
-
     if len(answers) < 2:
         return
     scenes: Counter[str] = Counter()
-    reasons: Counter[str] = Counter()
+    refused: Counter[str] = Counter()
     sigmas: list[float] = []
     for answer in answers:
         estimate = answer.estimate
+        pose = estimate.uncertain_pose
         if estimate.status != "ok":
-            reasons[estimate.status.replace("_", " ")] += 1
-            continue
-        scenes[str(estimate.scene)] += 1
-        pose = finite_pose(estimate)
-        if pose is not None and answer.unit_known:
-            sigmas.append(pose.sigma_mm)
+            refused[estimate.status.replace("_", " ")] += 1
+        else:
+            scenes[str(estimate.scene)] += 1
+            if pose is not None and answer.unit_known:
+                sigmas.append(pose.sigma_mm)
     line = f"{scenes.total()} of {len(answers)} images located"
-    if scenes:
-        line += f", in {_counts(scenes)}"
+    for words, counter in ((", in", scenes), ("; refused:", refused)):
+        if counter:
+            counts = ", ".join(f"{word} {n}" for word, n in counter.most_common())
+            line += f"{words} {counts}"
     if sigmas:
         line += f"; standard deviation {median(sigmas):.2f} mm per axis (median)"
-    if reasons:
-        line += f"; refused: {_counts(reasons)}"
     yield line
-
-
-def _counts(words: Counter[str]) -> str:
-    return ", ".join(f"{word} {count}" for word, count in words.most_common())

@@ -9,7 +9,7 @@ from evercal.learning.located import localizer_of, located_as_stated
 from evercal.learning.report import LearnReport
 from evercal.learning.stated_scatter import with_scatter
 from evercal.mapping.build import MapOptions, build_map
-from evercal.mapping.built_map import BuiltMap
+from evercal.mapping.built_map import LENGTHS, BuiltMap
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.progress import OnProgress
@@ -34,7 +34,8 @@ class LearnedScene:
         """The report of a scene that joins `contents`; `began` is a time of `perf_counter`."""
         adjusted = self.built.adjusted
         if not self.metric:
-            adjusted = replace(adjusted, common_translation_mm=None, pose_sigma_mm=None)
+            unknown = dict.fromkeys(LENGTHS)
+            adjusted = replace(adjusted, **unknown)
         return LearnReport(
             scene=self.scene.name,
             seconds=time.perf_counter() - began,

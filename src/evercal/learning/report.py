@@ -33,11 +33,21 @@ class LearnReport:
     hand_eye: "HandEye | None" = None
     """The estimated camera on the gripper; None where the recording states camera poses."""
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the map knows to be wrong about its recording."""
+        from evercal.learning.stated_warnings import stated_warnings
+
+        if self.adjusted is None:
+            return ()
+        return tuple(stated_warnings(self.adjusted, self.hand_eye is None))
+
     def to_dict(self) -> dict[str, Any]:
         """Return JSON values, as `evercal learn --json` prints them."""
         values = dict(vars(self))
         values["adjusted"] = self.adjusted and asdict(self.adjusted)
         values["hand_eye"] = self.hand_eye and self.hand_eye.to_dict()
+        values["warnings"] = list(self.warnings)
         # Networks have others.
         values.setdefault("iterations", 0)
         values.setdefault("head_bytes", 0)

@@ -28,6 +28,7 @@ from evercal.mapping.map_frame import (
 )
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.pose_check import check_poses, depth_scale, matched_pairs
+from evercal.mapping.pose_readings import require_consistent
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
 from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import select_farthest, spread_poses
@@ -199,6 +200,8 @@ def _prepare(
         unit = scale
         prepared = prepared.in_unit(scale)
     check = check_poses(prepared, pairs)
+    if options.mount is None:
+        require_consistent(prepared, pairs, check)
     consistent = prepared.without(check.excluded)
     # Other frames replace excluded keyframes.
     start = np.flatnonzero(np.isin(np.delete(support, check.excluded), wanted))
@@ -324,6 +327,7 @@ def _finish(
             doubtful_poses=frames.names(doubtful),
         )
         frame = _map_frame(adjustment, numbers, options)
+        adjusted = replace(adjusted, shared_mm=1000 * frame.shared_m)
         if not options.bundle.common_stated:
             # The common transform is part of the answer and not an error to undo.
             hand_eye = _hand_eye(frames, adjustment, options)

@@ -19,6 +19,16 @@ GAP = 10
 between similar keyframes are located more exactly than new images are."""
 MOST_PARTS = 12
 """Maximum number of parts that are left out in turn."""
+MOST_FOCAL_PERCENT = 1.0
+"""A larger change of the focal length indicates errors that the covariance does not contain."""
+LENGTHS = (
+    "common_translation_mm",
+    "common_sigma_mm",
+    "pose_sigma_mm",
+    "shared_mm",
+    "depth_m",
+)
+"""Fields of `Adjusted` that are None where the unit of length is unknown."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +40,14 @@ class Adjusted:
     length is unknown, as `pose_sigma_mm`."""
     common_rotation_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
     """(3,) its rotation vector."""
+    common_sigma_mm: float | None = 0.0
+    """Standard deviation of the length of that translation, with systematic errors; None as it."""
+    common_sigma_deg: float = 0.0
+    """The same for the angle, degrees."""
+    shared_mm: float | None = 0.0
+    """Root mean square per axis of errors of stated positions that neighbouring frames share."""
+    depth_m: float | None = None
+    """Median depth of the landmarks; None without adjustment, or where the unit is unknown."""
     focal_percent: float = 0.0
     """Change of the focal length."""
     residual_px: float | None = None
@@ -63,6 +81,7 @@ class Adjusted:
         `stated` and `camera` are the intrinsics before and after.
         """
         tangent = adjustment.common.log()
+        covariance = adjustment.common_covariance + adjustment.common_systematic
         size = (stated.width, stated.height)
         corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size - 0.5
         moved = np.linalg.norm(
@@ -71,6 +90,9 @@ class Adjusted:
         return cls(
             common_translation_mm=tuple((1000 * tangent[:3]).tolist()),
             common_rotation_deg=tuple(np.rad2deg(tangent[3:]).tolist()),
+            common_sigma_mm=1000 * _length_sigma(tangent[:3], covariance[:3, :3]),
+            common_sigma_deg=np.rad2deg(_length_sigma(tangent[3:], covariance[3:, 3:])),
+            depth_m=float(1 / np.median(adjustment.inverse_depth)),
             focal_percent=100 * (camera.fx / stated.fx - 1),
             residual_px=adjustment.residual_px,
             pose_sigma_mm=1000 * adjustment.sigma_m,
@@ -79,6 +101,13 @@ class Adjusted:
             corner_px=float(np.fmax.reduce(moved, initial=0.0)),
             intrinsics=(stated.to_dict(), camera.to_dict()),
         )
+
+
+def _length_sigma(vector: Array, covariance: Array) -> float:
+    """The length of a vector over its Mahalanobis distance from 0."""
+    length = float(np.linalg.norm(vector))
+    distance = float(np.sqrt(vector @ np.linalg.solve(covariance, vector)))
+    return length / max(distance, 1e-12)
 
 
 @dataclass(frozen=True, eq=False)

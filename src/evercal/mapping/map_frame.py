@@ -110,6 +110,13 @@ class MapFrame:
         return UncertainPose(SE3.identity(), self.base_covariance) @ estimate
 
     @property
+    def shared_m(self) -> float:
+        """Root mean square per axis of errors of stated positions that neighbours share."""
+        if self.correction is None:
+            return self.frame_sigma[0]
+        return float(np.sqrt((self.correction.correction[:, :3] ** 2).mean()))
+
+    @property
     def scale(self) -> float:
         """Units of length of an answer per unit of the map."""
         return 1.0 if self.similarity is None else self.similarity.scale

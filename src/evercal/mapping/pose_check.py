@@ -69,6 +69,8 @@ class PoseCheck:
     """Their stated pose contradicts the images."""
     untracked: IntArray
     """Their images neither confirm nor contradict the stated pose."""
+    share: float = 0.0
+    """Of the pairs that contradict the stated poses."""
 
     @property
     def excluded(self) -> IntArray:
@@ -91,8 +93,7 @@ def check_poses(recording: PreparedFrames, pairs: list[MatchedPair]) -> PoseChec
     """Find frames whose stated pose contradicts most of their partners."""
     count = len(recording)
     sift = _SiftCheck(recording)
-    distances = [_distance(recording, pair) for pair in pairs]
-    contradicts = np.array(distances) > MAX_DISTANCE_PX
+    contradicts = contradicting(recording, pairs)
     frames = np.array([(pair.first, pair.second) for pair in pairs]).reshape(-1, 2)
     rest = np.ones(len(pairs), bool)
     wrong: list[int] = []
@@ -112,7 +113,16 @@ def check_poses(recording: PreparedFrames, pairs: list[MatchedPair]) -> PoseChec
             untracked.append(worst)
         elif agree < max(disagree, 1):
             wrong.append(worst)
-    return PoseCheck(np.array(sorted(wrong), int), np.array(sorted(untracked), int))
+    share = float(contradicts.sum() / max(len(pairs), 1))
+    return PoseCheck(
+        np.array(sorted(wrong), int), np.array(sorted(untracked), int), share
+    )
+
+
+def contradicting(recording: PreparedFrames, pairs: list[MatchedPair]) -> BoolArray:
+    """(n,) pairs whose matches contradict the poses of the frames."""
+    distances = [_distance(recording, pair) for pair in pairs]
+    return np.array(distances) > MAX_DISTANCE_PX
 
 
 class _SiftCheck:

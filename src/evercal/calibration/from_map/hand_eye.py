@@ -22,12 +22,10 @@ from evercal.calibration.from_map.next_views import open_position
 from evercal.calibration.located import length_mm_deg
 from evercal.calibration.verdict import verdict
 from evercal.geometry import SE3, UncertainPose, pose_distance_mm_deg
-from evercal.mapping.built_map import Adjusted, BuiltMap
+from evercal.mapping.built_map import MOST_FOCAL_PERCENT, Adjusted, BuiltMap
 from evercal.recordings.frame import Frame, stated_grippers
 from evercal.robot.arm_offsets import ArmOffsets
 
-MOST_FOCAL_PERCENT = 1.0
-"""A larger change of the focal length indicates errors that the covariance does not contain."""
 MOST_POSE_SIGMA_MM = 5.0
 """A larger standard deviation of gripper positions indicates such errors, too; millimetres."""
 
