@@ -51,7 +51,9 @@ def require_consistent(
                 " the poses"
             )
     count = len(recording)
-    if len(check.wrong) > MOST_WRONG * count:
+    # Poses at one point are refused for their parallax.
+    moves = np.ptp(recording.stated.translation_m, axis=0).any()
+    if moves and len(check.wrong) > MOST_WRONG * count:
         from evercal.recordings.poses.pose_evidence import rotation_warnings
 
         causes = rotation_warnings(recording.frames, recording.stated, of_camera=True)
