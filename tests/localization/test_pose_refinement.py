@@ -213,7 +213,6 @@ def test_a_minimum_moves_to_that_of_another_prior(
             np.linalg.norm(root @ (step - real)) < off < 2 * np.linalg.norm(root @ step)
         )
         assert np.linalg.norm(root @ again) < 0.1  # it is at its own minimum
-        assert own.after(step).variance == pytest.approx(expected.variance, rel=0.15)
         ratio = np.linalg.eigvals(np.linalg.solve(inverse, covariance)).real
         assert np.abs(np.log(ratio)).mean() < 0.2 * off
 

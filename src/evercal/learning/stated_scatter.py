@@ -1,11 +1,24 @@
-"""Scatter of the stated frame about the map, fitted when a scene is learned."""
+"""Errors that only the frames of a recording show, estimated when a scene is learned.
 
-from collections.abc import Sequence
+How far the intrinsics of its camera move from image to image, and how far the stated frame scatters
+about the map.
+"""
+
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from evercal.geometry import Camera
+from evercal.localization.answer import in_base
+from evercal.localization.hypothesis import Aligned
+from evercal.localization.intrinsics import (
+    CERTAINLY_OWN,
+    FREE,
+    SAME_MODEL,
+    IntrinsicsPrior,
+)
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_map import LeftOut, MapContents, SceneMap
 from evercal.recordings.frame import Frame
@@ -13,11 +26,16 @@ from evercal.recordings.images import as_rgb
 from evercal.typing import Array
 
 LEAST_ANSWERS = 8
-"""Least number of answers that the scatter is fitted to."""
-WRONG_PLACE_M = 0.5
-"""Answers farther than this from the stated position are outliers, metres."""
+"""Least number of answers that errors are estimated from."""
+OUTLIER = 6.0
+"""An answer with a deviation of more medians is an outlier."""
 LEAST_VARIANCE = 1e-18
 """Least variance of an answer along any direction."""
+LESS_LIKELY = 1.353
+"""The scatter is a bound of 95 %: its likelihood is lower than the largest by this logarithm, half
+of the 90 % quantile of chi-squared with one degree of freedom."""
+ITERATIONS = 60
+"""Of the variances of moving intrinsics; small ones converge slowly, to 0."""
 
 
 def with_scatter(
@@ -26,10 +44,9 @@ def with_scatter(
     left_out: Sequence[LeftOut] = (),
     noise: tuple[float, float] = (0.0, 0.0),
 ) -> SceneMap:
-    """The newest scene of a map, with the scatter of its stated frame.
+    """The newest scene of a map, with the scatter of its intrinsics and of its stated frame.
 
-    Fitted to frames that were held out and aligned from their stated poses: the smallest scatter
-    that explains their errors.
+    Fitted to frames that were held out and aligned from their stated poses.
 
     Args:
         contents: The map.
@@ -38,14 +55,24 @@ def with_scatter(
         noise: Standard deviation of stated poses per axis, metres and radians, that is independent
             from frame to frame. It averages out in the map and is no error of an answer.
     """
-    *others, scene = contents.scenes
+    parts = [LeftOut(tuple(held_out), np.arange(len(contents.scenes[-1].keyframes)))]
+    parts += left_out
+    scene = contents.scenes[-1]
     # Scatter and its bounds are in the unit of the map.
     bare = replace(scene, frame=replace(scene.frame, frame_sigma=(0.0, 0.0)))
-    localizer = Localizer(replace(contents, scenes=[*others, bare]))
-    answers = _aligned(localizer, held_out, scene)
-    for part in left_out:
-        few = localizer.only(len(others), part.keyframes)
-        answers += _aligned(few, part.frames, scene)
+    freed = [aligned for _, aligned in _aligned(contents, bare, parts, FREE)]
+    if len(freed) < LEAST_ANSWERS:
+        return scene
+    changes = np.array([aligned.change for aligned in freed])
+    measured = np.array([aligned.measured for aligned in freed])
+    moving = intrinsics_sigma(changes, measured, freed[0].camera)
+    scene = replace(scene, intrinsics_sigma=moving)
+    bare = replace(bare, intrinsics_sigma=moving)
+    answers = []
+    for frame, aligned in _aligned(contents, bare, parts, CERTAINLY_OWN):
+        answer = _answer(frame, aligned, bare)
+        if np.isfinite(answer.covariance).all():
+            answers.append(answer)
     if len(answers) < LEAST_ANSWERS:
         return scene
     errors = np.array([answer.error for answer in answers])
@@ -58,6 +85,27 @@ def with_scatter(
     return replace(scene, frame=replace(scene.frame, frame_sigma=sigma))
 
 
+def _aligned(
+    contents: MapContents,
+    scene: SceneMap,
+    parts: Sequence[LeftOut],
+    prior: IntrinsicsPrior,
+) -> Iterator[tuple[Frame, Aligned]]:
+    """Frames and alignments that begin at their stated poses, with a prior of intrinsics."""
+    index = len(contents.scenes) - 1
+    localizer = Localizer(contents.with_replaced(index, scene))
+    for part in parts:
+        few = localizer.only(index, part.keyframes)
+        for frame in part.frames:
+            if frame.base_from_camera is None:
+                continue
+            start = scene.frame.from_base(frame.base_from_camera)
+            query = localizer.query(as_rgb(frame.read_image()), frame.camera)
+            aligned = few.aligned(query, index, start, prior)
+            if aligned is not None:
+                yield frame, aligned
+
+
 class _Answer(NamedTuple):
     """A located frame beside its stated pose."""
 
@@ -68,53 +116,65 @@ class _Answer(NamedTuple):
     """(6, 6)."""
 
 
-def _aligned(
-    localizer: Localizer, frames: Sequence[Frame], scene: SceneMap
-) -> list[_Answer]:
-    """Answers of alignments that begin at the stated poses, without outliers."""
-    answers = []
+def _answer(frame: Frame, aligned: Aligned, scene: SceneMap) -> _Answer:
+    stated = frame.base_from_camera
+    assert stated is not None, "only posed frames are aligned"
+    estimate, _ = in_base(aligned, scene)
+    rotation = (estimate.pose.inverse() @ stated).log()[3:]
+    shift = stated.translation_m - estimate.pose.translation_m
     size = np.repeat([scene.frame.scale, 1.0], 3)
-    index = localizer.scenes.index(scene.name)
-    for frame in frames:
-        stated = frame.base_from_camera
-        if stated is None:
-            continue
-        start = scene.frame.from_base(stated)
-        image = as_rgb(frame.read_image())
-        estimate = localizer.from_pose(image, frame.camera, index, start)
-        answer = estimate and estimate.uncertain_pose
-        if answer is None or not np.isfinite(answer.covariance).all():
-            continue
-        rotation = (answer.pose.inverse() @ stated).log()[3:]
-        shift = stated.translation_m - answer.pose.translation_m
-        error = np.r_[shift, rotation] / size
-        if np.linalg.norm(error[:3]) < WRONG_PLACE_M:
-            covariance = answer.covariance / np.outer(size, size)
-            answers.append(_Answer(error, covariance))
-    return answers
+    error = np.r_[shift, rotation] / size
+    return _Answer(error, estimate.covariance / np.outer(size, size))
+
+
+def intrinsics_sigma(
+    changes: Array, measured: Array, camera: Camera
+) -> tuple[float, float, float]:
+    """Standard deviations of `SceneMap.intrinsics_sigma`, from images that measure intrinsics.
+
+    Changes are (n, 5), their covariances (n, 5, 5). The variances with the greatest likelihood, by
+    expectation maximisation: a change c that was measured with the covariance M has the mean K c
+    and the covariance V - K V, K = V / (V + M).
+    """
+    side = max(camera.width, camera.height)
+    variances = SAME_MODEL.variances(camera)
+    for _ in range(ITERATIONS):
+        gain = variances[:, None] * np.linalg.inv(measured + np.diag(variances))
+        mean = np.einsum("nij,nj->ni", gain, changes)
+        left = variances - np.einsum("nii->ni", gain * variances)
+        squares = (mean**2 + left).mean(0)
+        for group in (slice(0, 1), slice(1, 3), slice(3, 5)):
+            variances[group] = squares[group].mean()
+    focal, centre, _, distortion, _ = np.sqrt(variances).tolist()
+    return focal, centre / side, distortion
 
 
 def scatter(errors: Array, covariances: Array) -> float:
-    """Smallest standard deviation per axis that makes errors fit their covariances.
+    """Largest standard deviation per axis that errors and their covariances do not contradict.
 
-    Errors are (n, 3), covariances (n, 3, 3). With the variance added to every axis, 90 % of the
-    squared Mahalanobis distances are below the 90 % quantile of their distribution. It is 0 where
-    they are without it.
+    Errors are (n, 3), covariances (n, 3, 3). It is added to every axis; see `LESS_LIKELY`.
     """
-    from scipy.optimize import brentq
-    from scipy.special import chdtri
+    from scipy.optimize import brentq, minimize_scalar
 
     values, axes = np.linalg.eigh(covariances)
     values = np.maximum(values, LEAST_VARIANCE)
     squares = np.einsum("nji,nj->ni", axes, errors) ** 2
-    limit = float(chdtri(3, 0.1))
+    deviations = np.sqrt((squares / values).sum(1))
+    usual = deviations <= OUTLIER * np.median(deviations)
+    values = values[usual]
+    squares = squares[usual]
+
+    def unlikeliness(sigma: float) -> float:
+        variances = values + sigma**2
+        return float((np.log(variances) + squares / variances).sum()) / 2
+
+    largest = 2 * float(np.sqrt(squares.sum(1).max()))
+    best = float(
+        minimize_scalar(unlikeliness, bounds=(0.0, largest), method="bounded").x
+    )
+    least = unlikeliness(best)
 
     def excess(sigma: float) -> float:
-        distances = (squares / (values + sigma**2)).sum(1)
-        # Few frames: a quantile between two of them would follow the worst one.
-        return float(np.quantile(distances, 0.9, method="lower")) - limit
+        return unlikeliness(sigma) - least - LESS_LIKELY
 
-    if excess(0.0) <= 0:
-        return 0.0
-    largest = 2 * float(np.sqrt(squares.sum(1).max()))
-    return float(brentq(excess, 0.0, largest))  # pyright: ignore[reportArgumentType]
+    return float(brentq(excess, best, 10 * largest))  # pyright: ignore[reportArgumentType]

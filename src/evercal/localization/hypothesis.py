@@ -91,6 +91,8 @@ class Aligned(Hypothesis):
     """(6, 6) share of the pose's covariance that is due to the intrinsics."""
     observed: Observed
     """Matched landmarks, in pixels of `Query.grey`."""
+    measured: Array
+    """(5, 5) covariance of the change as the image alone measures it."""
     matches: Matches = NO_MATCHES
     """All matches of the PnP pose."""
 

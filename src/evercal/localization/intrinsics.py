@@ -21,6 +21,8 @@ INTRINSICS = 5
 """Parameters of a change: logarithm of the focal lengths, principal point in pixels, k1, k2."""
 CONTRADICTED = 15.1
 """Squared Mahalanobis distance of all five, above which no prior holds: 99 % of chi-squared."""
+SURE = 0.9
+"""Probability of another camera above which the image is taken to be of one."""
 DOUBT = 3.0
 """Squared deviation, in variances, above which the prior is widened."""
 
@@ -41,11 +43,19 @@ class IntrinsicsPrior:
     """Probability that the image is of another camera of the same model, see `SAME_MODEL`."""
     kind: Kind = "stated"
     """What is known about the camera."""
+    scatter: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """How far intrinsics move from image to image, see `SceneMap.intrinsics_sigma`."""
 
     def variances(self, camera: Camera) -> Array:
         """(5,) variances of a change of intrinsics, see `Camera.changed`."""
         centre = self.centre * max(camera.width, camera.height)
         return np.square([self.focal, centre, centre, self.k1, self.k2])
+
+    def scattered(self, camera: Camera) -> Array:
+        """(5,) variances of intrinsics from image to image."""
+        focal, share, distortion = self.scatter
+        centre = share * max(camera.width, camera.height)
+        return np.square([focal, centre, centre, distortion, distortion])
 
     def tested(self, camera: Camera, change: Array, measured: Array) -> Array:
         """(5,) variances: those of the prior, wider where an estimate contradicts it.
@@ -86,9 +96,9 @@ class IntrinsicsPrior:
                 return 0.0, None
             return 0.0, variances
         doubt = self.doubt(camera, change, measured)
-        if doubt <= 0.5:
+        if doubt <= SURE:
             return doubt, None
-        return doubt, UNKNOWN.tested(camera, change, measured)
+        return doubt, SAME_MODEL.tested(camera, change, measured)
 
 
 OWN = IntrinsicsPrior(
@@ -104,6 +114,8 @@ state it for other cameras of the model, hence `other_camera`. Where an image sh
 the covariance includes the pose of another camera."""
 NOT_STATED = replace(OWN, kind="not stated")
 """No camera is stated, and the image has the size of the recording."""
+CERTAINLY_OWN = replace(OWN, other_camera=1e-200)
+"""The camera that recorded the scene, for frames of the recording."""
 SAME_MODEL = IntrinsicsPrior(
     focal=0.007,
     centre=0.007,
@@ -163,6 +175,11 @@ class RecordedScene(Protocol):
         """The same camera after learning."""
         ...
 
+    @property
+    def intrinsics_sigma(self) -> tuple[float, float, float]:
+        """How far its intrinsics move from image to image."""
+        ...
+
 
 def cameras_in_scenes(
     camera: Camera | None, image: Image, scenes: Sequence[RecordedScene]
@@ -202,6 +219,13 @@ def prior_of(
     camera: Camera | None, image: Image, scene: RecordedScene
 ) -> IntrinsicsPrior:
     """Prior of the intrinsics of an image: stated, the recording's, or unknown."""
+    prior = _prior_of(camera, image, scene)
+    return replace(prior, scatter=scene.intrinsics_sigma)
+
+
+def _prior_of(
+    camera: Camera | None, image: Image, scene: RecordedScene
+) -> IntrinsicsPrior:
     if camera is not None:
         if _is_own(camera, scene):
             return OWN

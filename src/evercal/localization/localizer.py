@@ -17,7 +17,12 @@ from evercal.geometry import SE3, Camera
 from evercal.localization.answer import answer
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.hypothesis import Aligned, Hypothesis, accepted, order
-from evercal.localization.intrinsics import INTRINSICS, cameras_in_scenes, prior_of
+from evercal.localization.intrinsics import (
+    INTRINSICS,
+    IntrinsicsPrior,
+    cameras_in_scenes,
+    prior_of,
+)
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.options import Attempt, LocalizeOptions
 from evercal.localization.query import Candidate, Encoded, Query
@@ -115,17 +120,19 @@ class Localizer:
         priors = [prior_of(camera, image, scene) for scene in scenes]
         return Query(image, self.options.patches_short_side, cameras, priors)
 
-    def from_pose(
-        self, image: Image, camera: Camera, scene: int, start: SE3
-    ) -> PoseEstimate | None:
-        """The answer of an alignment that begins at a pose map_from_camera in one scene."""
-        query = self.query(image, camera)
+    def aligned(
+        self, query: Query, scene: int, start: SE3, prior: IntrinsicsPrior
+    ) -> Aligned | None:
+        """The pose of an alignment that begins at a pose map_from_camera in one scene.
+
+        `prior` replaces that of the image.
+        """
+        priors = list(query.priors)
+        priors[scene] = replace(prior, scatter=priors[scene].scatter)
+        query = replace(query, priors=priors)
         seen = self.poses.bank.seen(scene, start, query.cameras[scene])
         candidate = Candidate(scene, seen[: self.options.keyframes])
-        aligned = self.poses.aligned(query, candidate, start, np.zeros(INTRINSICS))
-        if aligned is None:
-            return None
-        return answer(aligned, self.contents.scenes[scene], image.shape[:2], 0.0)
+        return self.poses.aligned(query, candidate, start, np.zeros(INTRINSICS))
 
     def _best_hypothesis(self, query: Query) -> Hypothesis | None:
         """The pose with the most support, from as few attempts as it takes."""

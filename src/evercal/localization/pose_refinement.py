@@ -28,9 +28,6 @@ _FIXED = np.zeros(0)
 """No variances: the intrinsics are fixed."""
 _UNCHANGED = np.zeros(INTRINSICS)
 """No change of the intrinsics."""
-_BENT_PX = 0.01
-"""Errors of a map that all landmarks may share, pixels. They bound how well many landmarks measure
-intrinsics: a flat wall seen from the front would otherwise seem to measure the focal length."""
 _RIDGE = 1e-12
 """Ridge of the scaled information: an unconstrained direction gets a huge variance."""
 
@@ -62,8 +59,6 @@ class Minimum:
     """(5,) of the intrinsics."""
     variance: float
     """Robust variance of the whitened errors."""
-    bent: float
-    """Variance that the share of all landmarks adds where they measure intrinsics."""
     data: Array
     """(6, 6) or (11, 11) information of the observations: of translation and rotation in camera
     axes, and of the intrinsics. Divided by `variance` it is that of the errors."""
@@ -78,7 +73,7 @@ class Minimum:
 
     def against(self, variances: Array) -> Array:
         """Information (5,) of a prior with variances (5,), as `moved` weighs it."""
-        return (self.variance + self.bent) / variances
+        return self.variance / variances
 
     def moved(self, prior: Array) -> tuple[Array, Array]:
         """Step (k,) to the minimum with another prior, and its covariance (k, k).
@@ -115,16 +110,14 @@ class Minimum:
         scores += shared * sums @ sums.T
         diagonal = slice(6 * count + 6, None, count + 1)
         hessian.flat[diagonal] += prior
-        scores.flat[diagonal] += prior * (self.variance + self.bent)
+        scores.flat[diagonal] += prior * self.variance
         inverse = normal_inverse(hessian, _RIDGE)
         return inverse @ scores @ inverse
 
-    def after(self, step: Array) -> "Minimum":
-        """The same with the residuals after a step (k,), to first order."""
-        residual = self.residual + np.tensordot(step, self.slope, 1)
-        squares = (residual**2).sum(0)
-        variance = robust_variance(squares)
-        return replace(self, residual=residual, variance=variance)
+    def by_intrinsics(self) -> Array:
+        """(6, 5) derivative of the pose, in camera axes, by intrinsics that are held."""
+        information = self.data[:6, :6]
+        return -normal_inverse(information, _RIDGE) @ self.data[:6, 6:]
 
     def pose(self, covariance: Array) -> UncertainPose:
         """points_from_camera with a covariance (6, 6) in camera axes."""
@@ -154,7 +147,6 @@ def minimise(
     now = camera.changed(change)
     moved = change.copy()
     free = len(variances)
-    bent = _BENT_PX**2 * float((observed.whitening**2).sum()) / 2
     for _ in range(max(iterations, 1)):
         raw, slope = linearise(
             observed.pixels, observed.points_m, rotation, position, now, free > 0
@@ -175,7 +167,6 @@ def minimise(
             camera=camera,
             change=moved,
             variance=variance,
-            bent=bent,
             data=data,
             gradient=gradient,
             residual=residual,

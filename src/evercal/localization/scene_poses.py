@@ -152,6 +152,7 @@ class ScenePoses:
             change=refined.change,
             by_intrinsics=refined.by_intrinsics,
             observed=observed,
+            measured=refined.measured,
         )
 
     def slips(self, aligned: Aligned) -> Array:

@@ -17,8 +17,6 @@ from evercal.typing import Array
 
 _MAX_ITERATIONS = 10
 """Gauss-Newton iterations of pose and intrinsics."""
-_ROUGH = 0.7
-"""If the residual variance changes by more than this ratio, the pose is estimated again."""
 _REACHED = 0.05 * 7.815
 """Probability times squared distance of another camera's pose above which the covariance includes
 it: 5 % at the 95 % quantile of chi-squared with three degrees of freedom."""
@@ -40,6 +38,8 @@ class RefinedPose:
     """(5,) change of the intrinsics."""
     by_intrinsics: Array
     """(6, 6) share of the pose's covariance that is due to the intrinsics."""
+    measured: Array
+    """(5, 5) covariance of the change as the image alone measures it."""
 
 
 def self_calibrated(
@@ -51,29 +51,23 @@ def self_calibrated(
 ) -> RefinedPose:
     """Pose and intrinsics; the prior gives way where the image contradicts it.
 
-    The start is that of `minimise`. Other priors than the stated one are a linear step away, unless
-    the image contradicts it.
+    The start is that of `minimise`.
     """
     stated = prior.variances(camera)
     free = FREE.variances(camera)
-    best = minimise(observed, camera, start, _MAX_ITERATIONS, stated, change)
+    scatter = np.diag(prior.scattered(camera))
     cells = cells_of(observed.pixels, camera)
-    step, _ = best.moved(best.against(free))
-    relaxed = best.after(step)
-    measured = _measured(relaxed, free, cells)
-    doubt, variances = prior.decided(camera, best.change + step[6:], measured)
-    rough = not _ROUGH < relaxed.variance / best.variance < 1 / _ROUGH
-    if variances is not None or doubt > prior.other_camera or rough:
-        start = best.rotation, best.position
-        freed = minimise(observed, camera, start, _MAX_ITERATIONS, free, best.change)
-        if freed.variance < relaxed.variance:
-            measured = _measured(freed, free, cells)
-            doubt, variances = prior.decided(camera, freed.change, measured)
-        if variances is not None:
-            start = freed.rotation, freed.position
-            best = minimise(
-                observed, camera, start, _MAX_ITERATIONS, variances, freed.change
-            )
+    best = minimise(observed, camera, start, _MAX_ITERATIONS, stated, change)
+    start = best.rotation, best.position
+    # A linear step would show half of the difference of another camera.
+    freed = minimise(observed, camera, start, _MAX_ITERATIONS, free, best.change)
+    measured = freed.covariance(freed.against(free), cells)[6:, 6:]
+    doubt, variances = prior.decided(camera, freed.change, measured + scatter)
+    if variances is not None:
+        start = freed.rotation, freed.position
+        best = minimise(
+            observed, camera, start, _MAX_ITERATIONS, variances, freed.change
+        )
     if variances is not None:
         covariance, lens = _covariances(best, variances, cells)
     else:
@@ -83,7 +77,11 @@ def self_calibrated(
             more = min(1.0, doubt / _REACHED) * wider
             covariance = covariance + more
             lens = lens + more
-    more = best.bent / best.variance * lens
+    slope = best.by_intrinsics()
+    more = slope @ scatter @ slope.T
+    # Stated rotations may have absorbed it: it does not tie rotation to position.
+    more[:3, 3:] = 0
+    more[3:, :3] = 0
     by_lens = in_parent_axes(best.rotation, lens + more)
     pose = best.pose(covariance + more)
     return RefinedPose(
@@ -93,6 +91,7 @@ def self_calibrated(
         camera=best.camera,
         change=best.change,
         by_intrinsics=by_lens,
+        measured=measured,
     )
 
 
@@ -106,12 +105,6 @@ def _reaching_other_camera(
     offset = (to_other - to_stated)[:6]
     _, of_other = _covariances(minimum, other, cells)
     return of_other - lens + np.outer(offset, offset)
-
-
-def _measured(minimum: Minimum, free: Array, cells: Array) -> Array:
-    """(5, 5) covariance of intrinsics without a prior."""
-    formal = minimum.covariance(minimum.against(free), cells)[6:, 6:]
-    return (1 + minimum.bent / minimum.variance) * formal
 
 
 def _covariances(

@@ -17,8 +17,6 @@ from evercal.typing import Array, IntArray
 GAP = 10
 """Cross-validation: frames without keyframes before and after a part that is left out. Frames
 between similar keyframes are located more exactly than new images are."""
-MOST_PARTS = 12
-"""Maximum number of parts that are left out in turn."""
 MOST_FOCAL_PERCENT = 1.0
 """A larger change of the focal length indicates errors that the covariance does not contain."""
 LENGTHS = (
@@ -29,6 +27,10 @@ LENGTHS = (
     "depth_m",
 )
 """Fields of `Adjusted` that are None where the unit of length is unknown."""
+MOST_PARTS = 48
+"""Maximum number of frames that are left out in turn."""
+PART = 4
+"""Frames between two that are left out, at least."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +182,7 @@ class BuiltMap:
         return replace(self, adjusted=adjusted)
 
     def left_out(self, frames: Sequence[Frame]) -> list[LeftOut]:
-        """Parts of the recording, each with the keyframes that were recorded before and after it.
+        """Frames of the recording, each with the keyframes recorded well before and after it.
 
         The frames are all that the map was built from, in recorded order. A recording that is too
         short for it, or that states gripper poses, gives none.
@@ -190,15 +192,14 @@ class BuiltMap:
         order = {frame.name: i for i, frame in enumerate(frames)}
         recorded = np.array([order[name] for name in self.keyframe_names])
         excluded = {*self.adjusted.wrong_poses, *self.adjusted.untracked}
-        count = min(MOST_PARTS, len(frames) // (2 * GAP))
+        count = min(MOST_PARTS, len(frames) // PART)
         parts = []
         middles = np.linspace(GAP, len(frames) - GAP - 1, count).astype(int)
         for middle in middles.tolist():
             others = np.flatnonzero(np.abs(recorded - middle) > GAP)
-            near = frames[middle - 3 : middle + 4 : 2]
-            usable = tuple(frame for frame in near if frame.name not in excluded)
-            if len(others) and usable:
-                parts.append(LeftOut(usable, others))
+            frame = frames[middle]
+            if len(others) and frame.name not in excluded:
+                parts.append(LeftOut((frame,), others))
         return parts
 
     def take(self, index: IntArray) -> "BuiltMap":

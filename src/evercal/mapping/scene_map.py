@@ -33,6 +33,9 @@ class SceneMap:
     """Relation of the landmarks' frame to the base frame."""
     train_frames: int
     """Frames that the map was built from."""
+    intrinsics_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Standard deviation of its intrinsics from image to image: focal length as a share, principal
+    point as a share of the longer side, k1 and k2. A stabilised camera moves its image."""
     parent_frame: str = "base"
     """Frame of the answers: base, or gripper for the map of a thing that the gripper holds."""
     unit: float | None = None

@@ -225,6 +225,7 @@ def write_scene(folder: Path, scene: SceneMap) -> None:
         "metric": scene.unit is None,
         "parent_frame": scene.parent_frame,
         "unit": scene.unit or 1.0,
+        "intrinsics_sigma": list(scene.intrinsics_sigma),
         "frame": frame_to_dict(scene.frame),
     }
     write_json(folder / SCENE, content)
@@ -269,6 +270,7 @@ def _read_scene(folder: Path) -> SceneMap:
     # Maps written by earlier versions lack some keys.
     if not content.get("metric", True):
         unit = content.get("unit", 1.0)
+    focal, centre, distortion = content.get("intrinsics_sigma", (0, 0, 0))
     return SceneMap(
         name=checked_name(content["name"]),
         camera=Camera.from_dict(content["camera"]),
@@ -276,6 +278,7 @@ def _read_scene(folder: Path) -> SceneMap:
         keyframes=Keyframes.from_tensors(open_tensors(folder / KEYFRAMES)),
         frame=frame_of(content["frame"], correction),
         train_frames=content["train_frames"],
+        intrinsics_sigma=(float(focal), float(centre), float(distortion)),
         parent_frame=content.get("parent_frame", "base"),
         unit=unit,
     )
