@@ -21,7 +21,7 @@ INTRINSICS = 5
 """Parameters of a change: logarithm of the focal lengths, principal point in pixels, k1, k2."""
 CONTRADICTED = 15.1
 """Squared Mahalanobis distance of all five, above which no prior holds: 99 % of chi-squared."""
-SURE = 0.9
+SURE = 0.6
 """Probability of another camera above which the image is taken to be of one."""
 DOUBT = 3.0
 """Squared deviation, in variances, above which the prior is widened."""
@@ -98,7 +98,7 @@ class IntrinsicsPrior:
         doubt = self.doubt(camera, change, measured)
         if doubt <= SURE:
             return doubt, None
-        return doubt, SAME_MODEL.tested(camera, change, measured)
+        return doubt, UNKNOWN.tested(camera, change, measured)
 
 
 OWN = IntrinsicsPrior(
@@ -219,11 +219,11 @@ def prior_of(
     camera: Camera | None, image: Image, scene: RecordedScene
 ) -> IntrinsicsPrior:
     """Prior of the intrinsics of an image: stated, the recording's, or unknown."""
-    prior = _prior_of(camera, image, scene)
+    prior = _stated_prior(camera, image, scene)
     return replace(prior, scatter=scene.intrinsics_sigma)
 
 
-def _prior_of(
+def _stated_prior(
     camera: Camera | None, image: Image, scene: RecordedScene
 ) -> IntrinsicsPrior:
     if camera is not None:

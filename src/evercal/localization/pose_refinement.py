@@ -28,6 +28,9 @@ _FIXED = np.zeros(0)
 """No variances: the intrinsics are fixed."""
 _UNCHANGED = np.zeros(INTRINSICS)
 """No change of the intrinsics."""
+_BENT_PX = 0.01
+"""Errors of a map that all landmarks may share, pixels. They bound how well many landmarks measure
+intrinsics: a flat wall seen from the front would otherwise seem to measure the focal length."""
 _RIDGE = 1e-12
 """Ridge of the scaled information: an unconstrained direction gets a huge variance."""
 
@@ -59,6 +62,8 @@ class Minimum:
     """(5,) of the intrinsics."""
     variance: float
     """Robust variance of the whitened errors."""
+    bent: float
+    """Variance that the share of all landmarks adds where they measure intrinsics."""
     data: Array
     """(6, 6) or (11, 11) information of the observations: of translation and rotation in camera
     axes, and of the intrinsics. Divided by `variance` it is that of the errors."""
@@ -73,7 +78,7 @@ class Minimum:
 
     def against(self, variances: Array) -> Array:
         """Information (5,) of a prior with variances (5,), as `moved` weighs it."""
-        return self.variance / variances
+        return (self.variance + self.bent) / variances
 
     def moved(self, prior: Array) -> tuple[Array, Array]:
         """Step (k,) to the minimum with another prior, and its covariance (k, k).
@@ -110,7 +115,7 @@ class Minimum:
         scores += shared * sums @ sums.T
         diagonal = slice(6 * count + 6, None, count + 1)
         hessian.flat[diagonal] += prior
-        scores.flat[diagonal] += prior * self.variance
+        scores.flat[diagonal] += prior * (self.variance + self.bent)
         inverse = normal_inverse(hessian, _RIDGE)
         return inverse @ scores @ inverse
 
@@ -147,6 +152,7 @@ def minimise(
     now = camera.changed(change)
     moved = change.copy()
     free = len(variances)
+    bent = _BENT_PX**2 * float((observed.whitening**2).sum()) / 2
     for _ in range(max(iterations, 1)):
         raw, slope = linearise(
             observed.pixels, observed.points_m, rotation, position, now, free > 0
@@ -167,6 +173,7 @@ def minimise(
             camera=camera,
             change=moved,
             variance=variance,
+            bent=bent,
             data=data,
             gradient=gradient,
             residual=residual,

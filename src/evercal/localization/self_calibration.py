@@ -7,7 +7,6 @@ import numpy as np
 from evercal.geometry import Camera, UncertainPose, in_parent_axes
 from evercal.localization.intrinsics import FREE, SAME_MODEL, IntrinsicsPrior
 from evercal.localization.pose_refinement import (
-    Minimum,
     Observed,
     Pose,
     cells_of,
@@ -62,56 +61,41 @@ def self_calibrated(
     # A linear step would show half of the difference of another camera.
     freed = minimise(observed, camera, start, _MAX_ITERATIONS, free, best.change)
     measured = freed.covariance(freed.against(free), cells)[6:, 6:]
+    measured *= 1 + freed.bent / freed.variance
     doubt, variances = prior.decided(camera, freed.change, measured + scatter)
     if variances is not None:
         start = freed.rotation, freed.position
         best = minimise(
             observed, camera, start, _MAX_ITERATIONS, variances, freed.change
         )
+    known = stated
     if variances is not None:
-        covariance, lens = _covariances(best, variances, cells)
-    else:
-        covariance, lens = _covariances(best, stated, cells)
-        if doubt:
-            wider = _reaching_other_camera(best, stated, lens, cells)
-            more = min(1.0, doubt / _REACHED) * wider
-            covariance = covariance + more
-            lens = lens + more
+        known = variances
+    certain = _posterior(measured, known)
+    if variances is None and doubt:
+        other = _posterior(measured, SAME_MODEL.variances(camera))
+        offset = other @ np.linalg.solve(measured, freed.change)
+        wider = other - certain + np.outer(offset, offset)
+        certain += min(1.0, doubt / _REACHED) * wider
     slope = best.by_intrinsics()
-    more = slope @ scatter @ slope.T
+    lens = slope @ certain @ slope.T
+    moving = slope @ scatter @ slope.T
     # Stated rotations may have absorbed it: it does not tie rotation to position.
-    more[:3, 3:] = 0
-    more[3:, :3] = 0
-    by_lens = in_parent_axes(best.rotation, lens + more)
-    pose = best.pose(covariance + more)
+    moving[:3, 3:] = 0
+    moving[3:, :3] = 0
+    lens += moving
+    noise = best.covariance(np.zeros(0), cells)
     return RefinedPose(
-        pose=pose,
+        pose=best.pose(noise + lens),
         observed=observed,
         residual_px=best.residual_px,
         camera=best.camera,
         change=best.change,
-        by_intrinsics=by_lens,
+        by_intrinsics=in_parent_axes(best.rotation, lens),
         measured=measured,
     )
 
 
-def _reaching_other_camera(
-    minimum: Minimum, stated: Array, lens: Array, cells: Array
-) -> Array:
-    """(6, 6) covariance whose deviation reaches to the pose of another camera of the model."""
-    other = SAME_MODEL.variances(minimum.camera)
-    to_other, _ = minimum.moved(minimum.against(other))
-    to_stated, _ = minimum.moved(minimum.against(stated))
-    offset = (to_other - to_stated)[:6]
-    _, of_other = _covariances(minimum, other, cells)
-    return of_other - lens + np.outer(offset, offset)
-
-
-def _covariances(
-    minimum: Minimum, variances: Array, cells: Array
-) -> tuple[Array, Array]:
-    """(6, 6) covariance of a pose in camera axes, and the share of the intrinsics in it."""
-    whole = minimum.covariance(minimum.against(variances), cells)[:6, :6]
-    share = whole - minimum.covariance(np.zeros(0), cells)
-    values, axes = np.linalg.eigh(share)
-    return whole, (axes * np.maximum(values, 0)) @ axes.T
+def _posterior(measured: Array, variances: Array) -> Array:
+    """Covariance (5, 5) of intrinsics that were measured, with a prior of variances (5,)."""
+    return np.linalg.inv(np.linalg.inv(measured) + np.diag(1 / variances))
