@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+import pandas as pd
 from scipy.interpolate import CubicSpline
 from tqdm import tqdm
 
@@ -86,7 +87,7 @@ def run(
         rows.append(row | _row([a for a in every if a["exact"]], name))
         row = {"stream": "all", "tracker": name}
         rows.append(row | _row(every, name))
-    save(out / "frames.csv", every)
+    pd.DataFrame(every).to_csv(out / "frames.csv", index=False, float_format="%.6g")
     save(out / "tracking.csv", rows)
 
 
@@ -208,6 +209,14 @@ def _column(answers: Sequence[Row], key: str, kind: type = float) -> Array:
 def _streams(
     out: Path, real: Path | None, frames: int, seeds: Sequence[int]
 ) -> Iterator[Stream]:
+    yield from _packaged(out)
+    if real is not None:
+        yield from _real(out, real)
+    for seed in seeds:
+        yield from _cells(out, seed, frames)
+
+
+def _packaged(out: Path) -> Iterator[Stream]:
     yield _wrist(out)
     for room in sample_rooms():
         scene = room.scene
@@ -216,25 +225,28 @@ def _streams(
         path = [*scene.train, *scene.test]
         path.sort(key=lambda frame: str(frame.image))
         yield Stream(scene.name, localizer, _recorded(path))
-    for name in ("fr1_rpy", "redkitchen") if real is not None else ():
-        assert real is not None
+
+
+def _real(out: Path, real: Path) -> Iterator[Stream]:
+    for name in ("fr1_rpy", "redkitchen"):
         recording = load_recording(real / name)
         localizer = _learned(out / f"{name}.evercal", recording)
         for stride in STRIDES:
             shown = recording.test[::stride]
             images = _recorded(shown, stride)
             yield Stream(f"{name}, 1 of {stride}", localizer, images, exact=False)
-    for seed in seeds:
-        folder = out / f"cell-{seed}"
-        cell = VirtualCell(seed, CellOptions(width=320, height=240))
-        if not folder.exists():
-            for _ in record_cell(folder, seed, wrist_images=60, options=cell.options):
-                pass
-        recording = load_recording(folder / "wrist")
-        localizer = _learned(out / f"cell-{seed}.evercal", recording)
-        for step in STEPS_MM:
-            images = _moving(cell, step / 1000, frames)
-            yield Stream(f"cell {seed}, {step} mm", localizer, images)
+
+
+def _cells(out: Path, seed: int, frames: int) -> Iterator[Stream]:
+    folder = out / f"cell-{seed}"
+    cell = VirtualCell(seed, CellOptions(width=320, height=240))
+    if not folder.exists():
+        for _ in record_cell(folder, seed, wrist_images=60, options=cell.options):
+            pass
+    localizer = _learned(out / f"cell-{seed}.evercal", load_recording(folder / "wrist"))
+    for step in STEPS_MM:
+        images = _moving(cell, step / 1000, frames)
+        yield Stream(f"cell {seed}, {step} mm", localizer, images)
 
 
 def _learned(store: Path, recording: Recording) -> Localizer:

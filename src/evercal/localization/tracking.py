@@ -1,9 +1,11 @@
 """`Tracker`: the camera poses of a stream; the last pose and its motion are the prior.
 
-A tracked frame is not encoded and not matched: landmarks of the keyframes next to the predicted
-pose are aligned at once. The pose must pass the same acceptance as that of a single image. A frame
-that does not is located from nothing, and so is one before repeated texture whose prediction leaves
-several periods open.
+A tracked frame is not encoded and not matched: landmarks that the predicted pose shows are aligned
+at once. From a prediction that is some pixels off, patches slide to other texture, and the pose
+between is no chance of a search, so it has a law of its own: landmarks move by a small share of the
+reach of their search, as many agree as in the frames before, and the support is that of a final
+pose of `localize`. Other frames are located from nothing, and so are those before repeated texture
+whose prediction leaves several periods open. Every `checked`th frame is located from nothing, too.
 """
 
 import time
@@ -15,16 +17,17 @@ from typing import Literal
 import numpy as np
 
 from evercal.errors import require_numbers
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry import SE3, Camera, pose_distance, resize_pixels
+from evercal.localization.acceptance import APART_SIGMAS
 from evercal.localization.answer import answer
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.hypothesis import Aligned, Hypothesis, accepted
 from evercal.localization.intrinsics import INTRINSICS
 from evercal.localization.localizer import Localizer
-from evercal.localization.query import Candidate
+from evercal.localization.query import Candidate, Query
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import as_rgb
-from evercal.typing import Array, Image, IntArray
+from evercal.typing import Array, Image
 
 TrackState = Literal["tracking", "relocalized", "lost"]
 _Located = tuple[PoseEstimate, Hypothesis | None]
@@ -39,6 +42,11 @@ MOST_SPEED_M_S = 1.0
 """Maximum speed of a camera that a prediction allows for; faster ones are rare on arms."""
 MOST_ACCELERATION_M_S2 = 10.0
 """Maximum acceleration of a camera that a prediction allows for."""
+TRUSTED_REACH = 1 / 3
+"""Motion of the landmarks in a fine search, median, as a share of its reach. A pose that moved them
+farther is half-way to its minimum (research/streams.md)."""
+LEAST_OF_RATIO = 0.85
+"""Minimum inlier ratio relative to the frames before."""
 
 
 @dataclass(frozen=True)
@@ -46,17 +54,13 @@ class TrackOptions:
     """How a stream is tracked."""
 
     keyframes: int = 4
-    """Number of keyframes next to the predicted pose that are aligned."""
+    """Number of keyframes that see most of the predicted view and are aligned."""
+    checked: int = 16
+    """Every n-th tracked frame in turn is also located from nothing."""
     fallback_s: float = 1 / 15
     """Time between frames without stamps, seconds."""
     longest_gap_s: float = 0.5
     """After a longer gap, seconds, the frame is located from nothing."""
-    reach_m: float = 0.10
-    """A pose that is farther from its prediction, metres, is verified by locating the frame."""
-    reach_deg: float = 8.0
-    """The same for the rotation, degrees."""
-    settled: float = 2.0
-    """Minimum support of the last pose, relative to the threshold, for using it as a prior."""
     at_most_ms: float | None = None
     """Time for a frame, milliseconds; what alignment misses is located in the background, `lost`
     meanwhile."""
@@ -66,9 +70,9 @@ class TrackOptions:
     """Jumps above this many sigmas reset the smoothing."""
 
     def __post_init__(self) -> None:
-        require_numbers(self, ("keyframes",), 1)
-        require_numbers(self, ("fallback_s", "longest_gap_s", "smooth"), 0)
-        require_numbers(self, ("reach_m", "reach_deg", "settled", "jump_sigmas"), 0)
+        require_numbers(self, ("keyframes", "checked"), 1)
+        numbers = ("fallback_s", "longest_gap_s", "smooth", "jump_sigmas")
+        require_numbers(self, numbers, 0)
         if self.at_most_ms is not None:
             require_numbers(self, ("at_most_ms",), 0)
 
@@ -81,8 +85,8 @@ class TrackedFrame:
     """From 0."""
     stamp_s: float
     state: TrackState
-    """`tracking`: located near its prediction. `relocalized`: located from nothing. `lost`: no
-    pose."""
+    """`tracking`: located near its prediction. `relocalized`: located from nothing, without a
+    prediction or against it. `lost`: no pose."""
     estimate: PoseEstimate
     smoothed: SE3 | None = None
     """base_from_camera, smoothed; None where lost or without smoothing."""
@@ -103,6 +107,13 @@ class Tracker:
     """Times and poses map_from_camera of the last two frames."""
     _change: Array = field(default_factory=lambda: np.zeros(INTRINSICS))
     """(5,) change of the intrinsics of the last frame."""
+    _ratio: float = 0.0
+    """Highest inlier ratio since the last frame that was located from nothing, and its own."""
+    _coarse: bool = True
+    """Whether the search begins coarse: the prediction of the last frame was off by more than a
+    fine one trusts."""
+    _unchecked: int = 0
+    """Frames since one was located from nothing."""
     _smoothed: tuple[float, SE3] | None = None
     _number: int = 0
     _alignment_s: float = 0.0
@@ -149,20 +160,21 @@ class Tracker:
                 yield self.track(item)
 
     def _located(self, image: Image, stamp: float) -> tuple[PoseEstimate, TrackState]:
-        estimate = self._near_prediction(image, stamp)
-        if estimate is not None:
-            return estimate, "tracking"
-        before = self._poses[-1:]
-        predicted = self._predicted(stamp)
-        scene = self._scene
+        tracked = self._near_prediction(image, stamp)
+        self._unchecked += 1
+        if tracked is not None and self._unchecked < self.options.checked:
+            return tracked, "tracking"
+        self._unchecked = 0
         estimate, pose = self.localizer.located(image, self.camera)
-        self._poses.clear()
+        if tracked is not None and _agree(tracked, estimate):
+            self._ratio = tracked.inlier_ratio
+            return tracked, "tracking"
+        self._ratio = 0.0
+        self._coarse = True
         if estimate.status != "ok" or pose is None:
+            self._poses.clear()
             return estimate, "lost"
         self._remember(pose, stamp)
-        same = bool(self._poses) and self._scene == scene
-        if predicted is not None and same and self._trusted(pose, predicted, 1.0):
-            self._poses = [*before, *self._poses]  # the motion goes on
         return estimate, "relocalized"
 
     def _located_in_time(
@@ -210,7 +222,7 @@ class Tracker:
         stamp, (estimate, pose) = finished
         if estimate.status != "ok" or pose is None:
             return False
-        self._remember(pose, stamp, settled=True)
+        self._remember(pose, stamp)
         return True
 
     def _near_prediction(
@@ -229,32 +241,54 @@ class Tracker:
         predicted = self._predicted(stamp)
         if predicted is None:
             return None
-        times = 1.0
-        searches = [False, True]
-        if adopted:
-            times = self.options.settled
-            searches = [True]
         query = self.localizer.query(image, self.camera)
-        candidate = Candidate(self._scene, self._next_keyframes(predicted))
-        for coarse in searches:
-            start = time.perf_counter()
-            if coarse and not adopted and start + _MARGIN * self._alignment_s > until:
+        coarse = self._coarse or adopted
+        pose, moved = self._searched(query, predicted, self._change, coarse)
+        self._coarse = moved > TRUSTED_REACH
+        if self._coarse and not coarse:
+            if self._late(until):
                 return None
-            pose = self.localizer.poses.aligned(
-                query, candidate, predicted, self._change, coarse
-            )
-            self._alignment_s = time.perf_counter() - start
-            if pose is None or not self._trusted(pose, predicted, times):
-                continue
-            if self._may_have_slipped(pose, predicted, stamp):
+            pose, moved = self._searched(query, predicted, self._change, True)
+        if pose is not None and moved > TRUSTED_REACH:
+            if self._late(until):
                 return None
-            milliseconds = 1000 * (time.perf_counter() - began)
-            estimate = answer(pose, self._map, image.shape[:2], milliseconds)
-            if estimate.status != "ok":  # too uncertain to be useful
-                return None
-            self._remember(pose, stamp)
-            return estimate
-        return None
+            pose, moved = self._searched(query, pose.pose.pose, pose.change, False)
+        if pose is None or moved > TRUSTED_REACH or not self._as_good(pose):
+            return None
+        if self._may_have_slipped(pose, predicted, stamp):
+            return None
+        milliseconds = 1000 * (time.perf_counter() - began)
+        estimate = answer(pose, self._map, image.shape[:2], milliseconds)
+        if estimate.status != "ok":  # too uncertain to be useful
+            return None
+        self._remember(pose, stamp)
+        return estimate
+
+    def _late(self, until: float) -> bool:
+        """Whether another search may take longer than the time for the frame."""
+        return time.perf_counter() + _MARGIN * self._alignment_s > until
+
+    def _searched(
+        self, query: Query, start: SE3, change: Array, coarse: bool
+    ) -> tuple[Aligned | None, float]:
+        """A pose near a start, and the median motion of its landmarks from there.
+
+        The motion is a share of the reach of a fine search; without a pose it is infinite.
+        """
+        began = time.perf_counter()
+        localizer = self.localizer
+        camera = query.camera(self._scene).changed(change)
+        seen = localizer.poses.bank.seen(self._scene, start, camera)
+        candidate = Candidate(self._scene, seen[: self.options.keyframes])
+        pose = localizer.poses.aligned(query, candidate, start, change, coarse)
+        self._alignment_s = time.perf_counter() - began
+        if pose is None:
+            return None, np.inf
+        before = camera.project(start.inverse().apply(pose.points_m))
+        grow = min(query.grey.shape) / localizer.contents.short_side
+        moves = np.linalg.norm(resize_pixels(pose.pixels, grow) - before, axis=1)
+        fine = localizer.options.alignment.rounds[1]
+        return pose, float(np.median(moves)) / fine.reach_px
 
     def _may_have_slipped(self, pose: Aligned, predicted: SE3, stamp: float) -> bool:
         """Whether a pose that lies a period of repeated texture away is as near the prediction."""
@@ -293,31 +327,24 @@ class Tracker:
         step = (first.inverse() @ pose).log()
         return pose @ SE3.exp(share * step)
 
-    def _next_keyframes(self, pose: SE3) -> IntArray:
-        """Keyframes in the bank next to a pose, in metres and radians."""
-        first = 0
-        for scene in self.localizer.contents.scenes[: self._scene]:
-            first += len(scene.keyframes)
-        metres, radians = pose_distance(pose, self._map.keyframes.base_from_camera)
-        spread = max(float(np.median(metres)), 1e-6)
-        order = np.argsort(metres / spread + radians, kind="stable")
-        return first + order[: self.options.keyframes]
-
-    def _trusted(self, pose: Hypothesis, predicted: SE3, times: float) -> bool:
-        """Whether a pose has enough support and is near its prediction."""
-        if not accepted(pose, times):
+    def _as_good(self, pose: Aligned) -> bool:
+        """Whether a pose has the support of a final one, and as many inliers as those before."""
+        if not accepted(pose, self.localizer.options.immediate):
             return False
-        metres, radians = pose_distance(pose.pose.pose, predicted)
-        near = self._at_room_scale(float(metres)) < self.options.reach_m
-        return near and float(radians) < np.deg2rad(self.options.reach_deg)
+        return pose.inlier_ratio >= LEAST_OF_RATIO * self._ratio
 
-    def _remember(self, pose: Hypothesis, stamp: float, settled: bool = False) -> None:
+    def _remember(self, pose: Hypothesis, stamp: float) -> None:
+        """Take a pose as that of the last frame."""
+        recent = []
+        for before in self._poses[-1:]:
+            if pose.scene == self._scene and stamp > before[0]:
+                recent.append(before)
         self._scene = pose.scene
         self._change = np.zeros(INTRINSICS)
         if isinstance(pose, Aligned):
             self._change = pose.change
-        if settled or self._poses or accepted(pose, self.options.settled):
-            self._poses = [*self._poses[-1:], (stamp, pose.pose.pose)]
+        self._ratio = max(self._ratio, pose.inlier_ratio)
+        self._poses = [*recent, (stamp, pose.pose.pose)]
 
     def _smooth(self, estimate: PoseEstimate, stamp: float) -> tuple[SE3 | None, bool]:
         """Return the smoothed pose, and whether it follows a jump."""
@@ -338,3 +365,14 @@ class Tracker:
             smoothed = before @ SE3.exp(gain * step)
         self._smoothed = (stamp, smoothed)
         return smoothed, bool(jumped)
+
+
+def _agree(tracked: PoseEstimate, alone: PoseEstimate) -> bool:
+    """Whether the location of a frame from nothing does not contradict its tracked pose."""
+    pose = tracked.uncertain_pose
+    other = alone.uncertain_pose
+    if pose is None or other is None:
+        return True
+    if tracked.scene != alone.scene:
+        return False
+    return pose.squared_mahalanobis(other.pose) < 6 * APART_SIGMAS
