@@ -3,8 +3,7 @@
 A tracked frame is not encoded and not matched: landmarks that the predicted pose shows are aligned
 at once. From a prediction that is some pixels off, patches slide to other texture, and the pose
 between is no chance of a search, so it has a law of its own: landmarks move by a small share of the
-reach of their search, as many agree as in the frames before, and the support is that of a final
-pose of `localize`. Other frames are located from nothing, and so are those before repeated texture
+reach of their search, and about as many agree as in the frames before. Other frames are located from nothing, and so are those before repeated texture
 whose prediction leaves several periods open. Every `checked`th frame is located from nothing, too.
 """
 
@@ -43,10 +42,12 @@ MOST_SPEED_M_S = 1.0
 MOST_ACCELERATION_M_S2 = 10.0
 """Maximum acceleration of a camera that a prediction allows for."""
 TRUSTED_REACH = 1 / 3
-"""Motion of the landmarks in a fine search, median, as a share of its reach. A pose that moved them
-farther is half-way to its minimum (research/streams.md)."""
-LEAST_OF_RATIO = 0.85
+"""Median motion of landmarks, as a share of the reach of their search, up to which one search finds
+the minimum. From farther away some poses are half-way, and the search is repeated from there."""
+LEAST_OF_RATIO = 0.75
 """Minimum inlier ratio relative to the frames before."""
+SETTLED = 2.0
+"""Minimum support, relative to that of an accepted pose."""
 
 
 @dataclass(frozen=True)
@@ -242,18 +243,26 @@ class Tracker:
         if predicted is None:
             return None
         query = self.localizer.query(image, self.camera)
+        fine_px, coarse_px = self._trusted_px()
         coarse = self._coarse or adopted
-        pose, moved = self._searched(query, predicted, self._change, coarse)
-        self._coarse = moved > TRUSTED_REACH
-        if self._coarse and not coarse:
+        pose, moved_px = self._searched(query, predicted, self._change, coarse)
+        self._coarse = moved_px > fine_px
+        if not coarse and not self._as_good(pose):
             if self._late(until):
                 return None
-            pose, moved = self._searched(query, predicted, self._change, True)
-        if pose is not None and moved > TRUSTED_REACH:
+            coarse = True
+            pose, moved_px = self._searched(query, predicted, self._change, True)
+        if pose is None:
+            return None
+        far = moved_px > (coarse_px if coarse else fine_px)
+        if far or not self._as_good(pose):
             if self._late(until):
                 return None
-            pose, moved = self._searched(query, pose.pose.pose, pose.change, False)
-        if pose is None or moved > TRUSTED_REACH or not self._as_good(pose):
+            start = pose.pose.pose
+            pose, moved_px = self._searched(query, start, pose.change, False)
+            if moved_px > fine_px:
+                return None
+        if pose is None or not self._as_good(pose):
             return None
         if self._may_have_slipped(pose, predicted, stamp):
             return None
@@ -271,10 +280,7 @@ class Tracker:
     def _searched(
         self, query: Query, start: SE3, change: Array, coarse: bool
     ) -> tuple[Aligned | None, float]:
-        """A pose near a start, and the median motion of its landmarks from there.
-
-        The motion is a share of the reach of a fine search; without a pose it is infinite.
-        """
+        """A pose near a start, and the median motion of its landmarks from there, pixels."""
         began = time.perf_counter()
         localizer = self.localizer
         camera = query.camera(self._scene).changed(change)
@@ -287,8 +293,12 @@ class Tracker:
         before = camera.project(start.inverse().apply(pose.points_m))
         grow = min(query.grey.shape) / localizer.contents.short_side
         moves = np.linalg.norm(resize_pixels(pose.pixels, grow) - before, axis=1)
-        fine = localizer.options.alignment.rounds[1]
-        return pose, float(np.median(moves)) / fine.reach_px
+        return pose, float(np.median(moves))
+
+    def _trusted_px(self) -> tuple[float, float]:
+        """Motions up to which a fine and a coarse search find their minimum at once, pixels."""
+        coarse, fine = self.localizer.options.alignment.rounds[:2]
+        return TRUSTED_REACH * fine.reach_px, TRUSTED_REACH * coarse.reach_px
 
     def _may_have_slipped(self, pose: Aligned, predicted: SE3, stamp: float) -> bool:
         """Whether a pose that lies a period of repeated texture away is as near the prediction."""
@@ -327,9 +337,9 @@ class Tracker:
         step = (first.inverse() @ pose).log()
         return pose @ SE3.exp(share * step)
 
-    def _as_good(self, pose: Aligned) -> bool:
-        """Whether a pose has the support of a final one, and as many inliers as those before."""
-        if not accepted(pose, self.localizer.options.immediate):
+    def _as_good(self, pose: Aligned | None) -> bool:
+        """Whether a pose has enough support and as many inliers as the frames before."""
+        if pose is None or not accepted(pose, SETTLED):
             return False
         return pose.inlier_ratio >= LEAST_OF_RATIO * self._ratio
 
