@@ -1,10 +1,11 @@
-"""`Tracker`: the camera poses of a stream; the last pose and its motion are the prior.
+"""`Tracker`: the camera poses of a stream; the last pose and the motion in the image are the prior.
 
-A tracked frame is not encoded and not matched: landmarks that the predicted pose shows are aligned
-at once. From a prediction that is some pixels off, patches slide to other texture, and the pose
-between is no chance of a search, so it has a law of its own: landmarks move by a small share of the
-reach of their search, and about as many agree as in the frames before. Other frames are located from nothing, and so are those before repeated texture
-whose prediction leaves several periods open. Every `checked`th frame is located from nothing, too.
+A tracked frame is not encoded and not matched. The landmarks of the last image are followed by
+optical flow, which predicts the pose to a pixel, and the landmarks of the map are aligned there.
+Such a pose is no chance of a search, so it has a law of its own: it agrees with the motion in the
+image, and about as many landmarks agree with it as in the frames before. Other frames are located
+from nothing, and so are those before repeated texture whose prediction leaves several periods open.
+Every n-th frame is located from nothing as well, and its pose replaces one that contradicts it.
 """
 
 import time
@@ -16,14 +17,16 @@ from typing import Literal
 import numpy as np
 
 from evercal.errors import require_numbers
-from evercal.geometry import SE3, Camera, pose_distance, resize_pixels
+from evercal.features.views import working_grey
+from evercal.geometry import SE3, Camera, pose_distance
 from evercal.localization.acceptance import APART_SIGMAS
 from evercal.localization.answer import answer
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.hypothesis import Aligned, Hypothesis, accepted
+from evercal.localization.image_motion import followed
 from evercal.localization.intrinsics import INTRINSICS
 from evercal.localization.localizer import Localizer
-from evercal.localization.query import Candidate, Query
+from evercal.localization.query import Candidate
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import as_rgb
 from evercal.typing import Array, Image
@@ -41,11 +44,11 @@ MOST_SPEED_M_S = 1.0
 """Maximum speed of a camera that a prediction allows for; faster ones are rare on arms."""
 MOST_ACCELERATION_M_S2 = 10.0
 """Maximum acceleration of a camera that a prediction allows for."""
-TRUSTED_REACH = 1 / 3
-"""Median motion of landmarks, as a share of the reach of their search, up to which one search finds
-the minimum. From farther away some poses are half-way, and the search is repeated from there."""
+MOST_MOVED_PX = 1.0
+"""Maximum median distance of landmarks from where their motion in the image predicts them, pixels
+at working size. From farther away alignment may end in another minimum (research/streams.md)."""
 LEAST_OF_RATIO = 0.75
-"""Minimum inlier ratio relative to the frames before."""
+"""Minimum inlier ratio, relative to the highest one since a frame was located from nothing."""
 SETTLED = 2.0
 """Minimum support, relative to that of an accepted pose."""
 
@@ -95,6 +98,17 @@ class TrackedFrame:
     """Whether the smoothed pose was reset to this measurement."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Running:
+    """A frame that is located in the background."""
+
+    image: Image
+    stamp: float
+    tracked: PoseEstimate | None
+    """Its tracked pose, which is checked."""
+    future: Future[_Located]
+
+
 @dataclass(eq=False)
 class Tracker:
     """Locates the frames of one camera in order."""
@@ -110,9 +124,8 @@ class Tracker:
     """(5,) change of the intrinsics of the last frame."""
     _ratio: float = 0.0
     """Highest inlier ratio since the last frame that was located from nothing, and its own."""
-    _coarse: bool = True
-    """Whether the search begins coarse: the prediction of the last frame was off by more than a
-    fine one trusts."""
+    _last: tuple[Image, Hypothesis] | None = None
+    """The last located image, at working size, and its pose."""
     _unchecked: int = 0
     """Frames since one was located from nothing."""
     _smoothed: tuple[float, SE3] | None = None
@@ -120,8 +133,7 @@ class Tracker:
     _alignment_s: float = 0.0
     """Time of the last alignment."""
     _pool: ThreadPoolExecutor | None = None
-    _running: tuple[float, Future[_Located]] | None = None
-    """Time of a frame that is located in the background, and its result."""
+    _running: "_Running | None" = None
 
     def track(self, image: np.ndarray, stamp_s: float | None = None) -> TrackedFrame:
         """Locate the next frame, an image as for `Localizer.localize`, at a time in seconds.
@@ -165,18 +177,35 @@ class Tracker:
         self._unchecked += 1
         if tracked is not None and self._unchecked < self.options.checked:
             return tracked, "tracking"
-        self._unchecked = 0
-        estimate, pose = self.localizer.located(image, self.camera)
-        if tracked is not None and _agree(tracked, estimate):
-            self._ratio = tracked.inlier_ratio
+        located = self.localizer.located(image, self.camera)
+        if tracked is not None and self._confirmed(tracked, located[0]):
             return tracked, "tracking"
+        return self._relocalized(image, stamp, located)
+
+    def _relocalized(
+        self, image: Image, stamp: float, located: _Located
+    ) -> tuple[PoseEstimate, TrackState]:
+        """Go on from the pose of a frame that was located from nothing."""
+        estimate, pose = located
+        self._unchecked = 0
         self._ratio = 0.0
-        self._coarse = True
         if estimate.status != "ok" or pose is None:
             self._poses.clear()
             return estimate, "lost"
-        self._remember(pose, stamp)
+        self._remember(pose, stamp, image)
         return estimate, "relocalized"
+
+    def _confirmed(self, tracked: PoseEstimate, alone: PoseEstimate) -> bool:
+        """Whether the location of a frame from nothing does not contradict its tracked pose."""
+        pose = tracked.uncertain_pose
+        other = alone.uncertain_pose
+        if pose is not None and other is not None:
+            squares = pose.squared_mahalanobis(other.pose)
+            if tracked.scene != alone.scene or squares > APART_SIGMAS**2:
+                return False
+        self._unchecked = 0
+        self._ratio = tracked.inlier_ratio
+        return True
 
     def _located_in_time(
         self, image: Image, stamp: float, until: float
@@ -184,85 +213,69 @@ class Tracker:
         """The same until a time of the clock; what takes longer goes on in the background."""
         began = time.perf_counter()
         adopted = self._adopted(until)
-        estimate = self._near_prediction(image, stamp, until, adopted)
-        if estimate is not None:
-            if adopted:
-                return estimate, "relocalized"
-            return estimate, "tracking"
-        self._poses.clear()
-        if self._running is None:
+        tracked = self._near_prediction(image, stamp)
+        self._unchecked += 1
+        due = tracked is None or self._unchecked >= self.options.checked
+        started = due and self._running is None
+        if started:
             self._pool = self._pool or ThreadPoolExecutor(1, "search")
             future = self._pool.submit(self.localizer.located, image, self.camera)
-            self._running = stamp, future
+            self._running = _Running(image, stamp, tracked, future)
+        if tracked is not None:
+            if adopted:
+                return tracked, "relocalized"
+            return tracked, "tracking"
+        self._poses.clear()
+        if started:
             finished = self._finished(until - _ANSWER_S)
             if finished is not None:
-                estimate, pose = finished[1]
-                if estimate.status != "ok" or pose is None:
-                    return estimate, "lost"
-                self._remember(pose, stamp)
-                return estimate, "relocalized"
+                return self._relocalized(image, stamp, finished.future.result())
         spent = 1000 * (time.perf_counter() - began)
         searching = PoseEstimate.failed(_SEARCHING, spent)
         return replace(searching, omitted=("localization",)), "lost"
 
-    def _finished(self, until: float) -> tuple[float, _Located] | None:
-        """Time and result of the frame in the background; None if it is not ready in time."""
-        if self._running is None:
+    def _finished(self, until: float) -> "_Running | None":
+        """The frame in the background; None if it is not located in time."""
+        running = self._running
+        if running is None:
             return None
-        stamp, future = self._running
-        if not wait([future], max(until - time.perf_counter(), 0.0)).done:
+        if not wait([running.future], max(until - time.perf_counter(), 0.0)).done:
             return None
         self._running = None
-        return stamp, future.result()
+        return running
 
     def _adopted(self, until: float) -> bool:
-        """Whether the frame in the background was located, so that its pose is the prior."""
+        """Whether the pose of the frame in the background is the prior from now on."""
         finished = self._finished(until - _MARGIN * self._alignment_s)
         if finished is None:
             return False
-        stamp, (estimate, pose) = finished
-        if estimate.status != "ok" or pose is None:
+        located = finished.future.result()
+        tracked = finished.tracked
+        if tracked is not None and self._poses and self._confirmed(tracked, located[0]):
             return False
-        self._remember(pose, stamp)
-        return True
+        _, state = self._relocalized(finished.image, finished.stamp, located)
+        return state == "relocalized"
 
-    def _near_prediction(
-        self,
-        image: Image,
-        stamp: float,
-        until: float = np.inf,
-        adopted: bool = False,
-    ) -> PoseEstimate | None:
-        """Align the landmarks around the predicted pose; None if that does not suffice.
-
-        The pose of an earlier frame that is `adopted` is farther away and was not confirmed: the
-        search is coarse, and the pose needs the support of a settled one.
-        """
+    def _near_prediction(self, image: Image, stamp: float) -> PoseEstimate | None:
+        """Follow the landmarks of the last image and align; None if that does not suffice."""
         began = time.perf_counter()
         predicted = self._predicted(stamp)
-        if predicted is None:
+        if predicted is None or self._last is None:
             return None
-        query = self.localizer.query(image, self.camera)
-        fine_px, coarse_px = self._trusted_px()
-        coarse = self._coarse or adopted
-        pose, moved_px = self._searched(query, predicted, self._change, coarse)
-        self._coarse = moved_px > fine_px
-        if not coarse and not self._as_good(pose):
-            if self._late(until):
-                return None
-            coarse = True
-            pose, moved_px = self._searched(query, predicted, self._change, True)
-        if pose is None:
+        localizer = self.localizer
+        query = localizer.query(image, self.camera)
+        camera = query.camera(self._scene).changed(self._change)
+        small = camera.short_side_resized(localizer.contents.short_side)
+        start = followed(*self._last, self._small(image), small, predicted)
+        if start is None:
             return None
-        far = moved_px > (coarse_px if coarse else fine_px)
-        if far or not self._as_good(pose):
-            if self._late(until):
-                return None
-            start = pose.pose.pose
-            pose, moved_px = self._searched(query, start, pose.change, False)
-            if moved_px > fine_px:
-                return None
-        if pose is None or not self._as_good(pose):
+        seen = localizer.poses.bank.seen(self._scene, start, camera)
+        candidate = Candidate(self._scene, seen[: self.options.keyframes])
+        pose = localizer.poses.aligned(
+            query, candidate, start, self._change, coarse=False
+        )
+        self._alignment_s = time.perf_counter() - began
+        if pose is None or not self._trusted(pose, start, small):
             return None
         if self._may_have_slipped(pose, predicted, stamp):
             return None
@@ -270,35 +283,22 @@ class Tracker:
         estimate = answer(pose, self._map, image.shape[:2], milliseconds)
         if estimate.status != "ok":  # too uncertain to be useful
             return None
-        self._remember(pose, stamp)
+        self._remember(pose, stamp, image)
         return estimate
 
-    def _late(self, until: float) -> bool:
-        """Whether another search may take longer than the time for the frame."""
-        return time.perf_counter() + _MARGIN * self._alignment_s > until
-
-    def _searched(
-        self, query: Query, start: SE3, change: Array, coarse: bool
-    ) -> tuple[Aligned | None, float]:
-        """A pose near a start, and the median motion of its landmarks from there, pixels."""
-        began = time.perf_counter()
-        localizer = self.localizer
-        camera = query.camera(self._scene).changed(change)
-        seen = localizer.poses.bank.seen(self._scene, start, camera)
-        candidate = Candidate(self._scene, seen[: self.options.keyframes])
-        pose = localizer.poses.aligned(query, candidate, start, change, coarse)
-        self._alignment_s = time.perf_counter() - began
-        if pose is None:
-            return None, np.inf
+    def _trusted(self, pose: Aligned, start: SE3, camera: Camera) -> bool:
+        """Whether a pose is no local minimum: the law of poses that were not searched for."""
+        if not accepted(pose, SETTLED):
+            return False
+        if pose.inlier_ratio < LEAST_OF_RATIO * self._ratio:
+            return False
         before = camera.project(start.inverse().apply(pose.points_m))
-        grow = min(query.grey.shape) / localizer.contents.short_side
-        moves = np.linalg.norm(resize_pixels(pose.pixels, grow) - before, axis=1)
-        return pose, float(np.median(moves))
+        moved_px = np.median(np.linalg.norm(pose.pixels - before, axis=1))
+        return bool(moved_px < MOST_MOVED_PX)
 
-    def _trusted_px(self) -> tuple[float, float]:
-        """Motions up to which a fine and a coarse search find their minimum at once, pixels."""
-        coarse, fine = self.localizer.options.alignment.rounds[:2]
-        return TRUSTED_REACH * fine.reach_px, TRUSTED_REACH * coarse.reach_px
+    def _small(self, image: Image) -> Image:
+        """An image at the size in which landmarks are followed."""
+        return working_grey(image, self.localizer.contents.short_side)
 
     def _may_have_slipped(self, pose: Aligned, predicted: SE3, stamp: float) -> bool:
         """Whether a pose that lies a period of repeated texture away is as near the prediction."""
@@ -337,13 +337,7 @@ class Tracker:
         step = (first.inverse() @ pose).log()
         return pose @ SE3.exp(share * step)
 
-    def _as_good(self, pose: Aligned | None) -> bool:
-        """Whether a pose has enough support and as many inliers as the frames before."""
-        if pose is None or not accepted(pose, SETTLED):
-            return False
-        return pose.inlier_ratio >= LEAST_OF_RATIO * self._ratio
-
-    def _remember(self, pose: Hypothesis, stamp: float) -> None:
+    def _remember(self, pose: Hypothesis, stamp: float, image: Image) -> None:
         """Take a pose as that of the last frame."""
         recent = []
         for before in self._poses[-1:]:
@@ -355,6 +349,7 @@ class Tracker:
             self._change = pose.change
         self._ratio = max(self._ratio, pose.inlier_ratio)
         self._poses = [*recent, (stamp, pose.pose.pose)]
+        self._last = self._small(image), pose
 
     def _smooth(self, estimate: PoseEstimate, stamp: float) -> tuple[SE3 | None, bool]:
         """Return the smoothed pose, and whether it follows a jump."""
@@ -375,14 +370,3 @@ class Tracker:
             smoothed = before @ SE3.exp(gain * step)
         self._smoothed = (stamp, smoothed)
         return smoothed, bool(jumped)
-
-
-def _agree(tracked: PoseEstimate, alone: PoseEstimate) -> bool:
-    """Whether the location of a frame from nothing does not contradict its tracked pose."""
-    pose = tracked.uncertain_pose
-    other = alone.uncertain_pose
-    if pose is None or other is None:
-        return True
-    if tracked.scene != alone.scene:
-        return False
-    return pose.squared_mahalanobis(other.pose) < 6 * APART_SIGMAS
