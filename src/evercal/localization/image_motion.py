@@ -8,7 +8,7 @@ from evercal.localization.hypothesis import Hypothesis
 from evercal.localization.pose_refinement import Observed, minimise
 from evercal.typing import Image
 
-MOST_LANDMARKS = 100
+MOST_LANDMARKS = 60
 """Maximum number of landmarks that are followed."""
 LEAST_LANDMARKS = 12
 """Minimum number of landmarks that are followed."""

@@ -49,16 +49,14 @@ MOST_MOVED_PX = 1.0
 at working size. From farther away alignment may end in another minimum (research/streams.md)."""
 LEAST_OF_RATIO = 0.75
 """Minimum inlier ratio, relative to the highest one since a frame was located from nothing."""
-SETTLED = 2.0
-"""Minimum support, relative to that of an accepted pose."""
+MOST_CHANGES = 15
+"""Number of frames, the median of whose intrinsics the next one starts with."""
 
 
 @dataclass(frozen=True)
 class TrackOptions:
     """How a stream is tracked."""
 
-    keyframes: int = 4
-    """Number of keyframes that see most of the predicted view and are aligned."""
     checked: int = 16
     """Every n-th tracked frame in turn is also located from nothing."""
     fallback_s: float = 1 / 15
@@ -74,7 +72,7 @@ class TrackOptions:
     """Jumps above this many sigmas reset the smoothing."""
 
     def __post_init__(self) -> None:
-        require_numbers(self, ("keyframes", "checked"), 1)
+        require_numbers(self, ("checked",), 1)
         numbers = ("fallback_s", "longest_gap_s", "smooth", "jump_sigmas")
         require_numbers(self, numbers, 0)
         if self.at_most_ms is not None:
@@ -120,8 +118,8 @@ class Tracker:
     _scene: int = -1
     _poses: list[tuple[float, SE3]] = field(default_factory=list)
     """Times and poses map_from_camera of the last two frames."""
-    _change: Array = field(default_factory=lambda: np.zeros(INTRINSICS))
-    """(5,) change of the intrinsics of the last frame."""
+    _changes: list[Array] = field(default_factory=list)
+    """Changes (5,) of the intrinsics of the last frames."""
     _ratio: float = 0.0
     """Highest inlier ratio since the last frame that was located from nothing, and its own."""
     _last: tuple[Image, Hypothesis] | None = None
@@ -264,16 +262,16 @@ class Tracker:
             return None
         localizer = self.localizer
         query = localizer.query(image, self.camera)
-        camera = query.camera(self._scene).changed(self._change)
+        # A stream has one camera: the next frame must not inherit the mistake of a single one.
+        change = np.median(self._changes, axis=0)
+        camera = query.camera(self._scene).changed(change)
         small = camera.short_side_resized(localizer.contents.short_side)
         start = followed(*self._last, self._small(image), small, predicted)
         if start is None:
             return None
         seen = localizer.poses.bank.seen(self._scene, start, camera)
-        candidate = Candidate(self._scene, seen[: self.options.keyframes])
-        pose = localizer.poses.aligned(
-            query, candidate, start, self._change, coarse=False
-        )
+        candidate = Candidate(self._scene, seen[: localizer.options.keyframes])
+        pose = localizer.poses.aligned(query, candidate, start, change, coarse=False)
         self._alignment_s = time.perf_counter() - began
         if pose is None or not self._trusted(pose, start, small):
             return None
@@ -288,7 +286,7 @@ class Tracker:
 
     def _trusted(self, pose: Aligned, start: SE3, camera: Camera) -> bool:
         """Whether a pose is no local minimum: the law of poses that were not searched for."""
-        if not accepted(pose, SETTLED):
+        if not accepted(pose):
             return False
         if pose.inlier_ratio < LEAST_OF_RATIO * self._ratio:
             return False
@@ -343,10 +341,13 @@ class Tracker:
         for before in self._poses[-1:]:
             if pose.scene == self._scene and stamp > before[0]:
                 recent.append(before)
-        self._scene = pose.scene
-        self._change = np.zeros(INTRINSICS)
+        if pose.scene != self._scene:
+            self._changes.clear()
+        change = np.zeros(INTRINSICS)
         if isinstance(pose, Aligned):
-            self._change = pose.change
+            change = pose.change
+        self._changes = [*self._changes, change][-MOST_CHANGES:]
+        self._scene = pose.scene
         self._ratio = max(self._ratio, pose.inlier_ratio)
         self._poses = [*recent, (stamp, pose.pose.pose)]
         self._last = self._small(image), pose
