@@ -157,21 +157,11 @@ class Localizer:
         return best
 
     def _mirrored_support(self, query: Query) -> float:
-        """Support of the mirror image, by the first attempt."""
-        contents = self.contents
-        image = np.ascontiguousarray(query.image[:, ::-1])
-        cameras = []
-        for camera in query.cameras:
-            cameras.append(replace(camera, cx=camera.width - 1 - camera.cx))
-        encoded = Encoded(contents.encoder.encode(image, contents.short_side))
-        query = Query(image, query.short_side, cameras, query.priors, encoded)
-        first = self.options.attempts[0]
-        best = self._tried(query, first)
-        if self._inliers(best) == "few inliers":
-            upright = self.poses.matcher.upright(query)
-            if upright.turns:
-                best = self._tried(replace(query, encoded=upright), first)
-        return order(best)[0]
+        """Support of the mirror image, if it is more similar to keyframes."""
+        mirror = self.poses.matcher.mirrored(query)
+        if mirror is None:
+            return 0.0
+        return order(self._tried(mirror, self.options.attempts[0]))[0]
 
     def _inliers(self, best: Hypothesis | None) -> str:
         """Whether PnP has many inliers, in the words of `Attempt.when`."""

@@ -1,5 +1,8 @@
 """Candidate scenes and keyframes of an image, and the 2D-3D matches of its patches."""
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 
 from evercal.features.views import cell_centres, ideal_cell_pixels, working_grey
@@ -65,6 +68,30 @@ class Matcher:
 
     def upright(self, query: Query) -> Encoded:
         """The image in the quarter turn whose middle is most similar to keyframes."""
+        turns = self._most_similar_view(query, [1, 2, 3], turned)
+        if not turns:
+            return query.encoded
+        grey = working_grey(query.image, self._short_side)
+        return Encoded(self._bank.encoder(turned(grey, turns)), turns=turns)
+
+    def mirrored(self, query: Query) -> Query | None:
+        """The mirror image, upside down or not, if its middle is more similar to keyframes."""
+        axis = self._most_similar_view(query, [1, 2], _mirror)
+        if not axis:
+            return None
+        image = _mirror(query.image, 1)
+        cameras = []
+        for camera in query.cameras:
+            cameras.append(replace(camera, cx=camera.width - 1 - camera.cx))
+        grey = working_grey(image, self._short_side)
+        turns = 2 * (axis - 1)
+        encoded = Encoded(self._bank.encoder(turned(grey, turns)), turns=turns)
+        return replace(query, image=image, cameras=cameras, encoded=encoded)
+
+    def _most_similar_view(
+        self, query: Query, views: list[int], view: Callable[[Image, int], Image]
+    ) -> int:
+        """The view whose middle is clearly more similar to keyframes than the image; or 0."""
         grey = working_grey(query.image, self._short_side)
         encoder = self._bank.encoder
         features = query.encoded.features
@@ -74,21 +101,19 @@ class Matcher:
         top = (rows - side) // 2
         left = (columns - side) // 2
         middle = grey[stride * top :, stride * left :][: stride * side, : stride * side]
-        # Side by side, the other turns take two thirds of the time.
-        others = encoder(
-            np.concatenate([turned(middle, turns) for turns in (1, 2, 3)], 1)
-        )
-        views = [
+        # Side by side, three turns take two thirds of the time.
+        others = encoder(np.concatenate([view(middle, number) for number in views], 1))
+        middles = [
             features[top : top + side, left : left + side],
-            *np.split(others, 3, 1),
+            *np.split(others, len(views), 1),
         ]
         similar = []
-        for view, similarity in zip(views, self._similarity(*views), strict=True):
-            similar.append(self._mean_similarity(view, similarity))
-        turns = int(np.argmax(similar))
-        if similar[turns] <= similar[0] + self._options.clear_turn:
-            return query.encoded
-        return Encoded(encoder(turned(grey, turns)), turns=turns)
+        for each, similarity in zip(middles, self._similarity(*middles), strict=True):
+            similar.append(self._mean_similarity(each, similarity))
+        best = int(np.argmax(similar))
+        if similar[best] <= similar[0] + self._options.clear_turn:
+            return 0
+        return views[best - 1]
 
     def magnified(self, query: Query, scale: float) -> Encoded:
         """The image encoded at another size."""
@@ -162,6 +187,11 @@ def _grid(encoded: Encoded, stride: int) -> IntArray:
     """Indices (n,) of the patches of every `stride`-th row and column."""
     rows, columns = encoded.features.shape[:2]
     return np.arange(rows * columns).reshape(rows, columns)[::stride, ::stride].ravel()
+
+
+def _mirror(image: Image, axis: int) -> Image:
+    """An image mirrored left to right (1), or top to bottom (2)."""
+    return np.ascontiguousarray(np.flip(image, axis % 2))
 
 
 def turned(image: Image, turns: int) -> Image:
