@@ -34,6 +34,9 @@ from evercal.processes import one_product_thread
 from evercal.recordings.images import as_rgb
 from evercal.typing import Image, IntArray, PathLike
 
+MIRRORED = 4.0
+"""The mirror image is tried where a pose has less than this many times the required support."""
+
 
 class Localizer:
     """Locates images in the scenes of a map."""
@@ -106,7 +109,7 @@ class Localizer:
         mirrored = 0.0
         if isinstance(best, Aligned) and accepted(best):
             best, rival = settled(self.poses, query, best)
-            if not accepted(best, self.options.immediate):
+            if not accepted(best, MIRRORED):
                 mirrored = self._mirrored_support(query)
         milliseconds = 1000 * (time.perf_counter() - began)
         scene = contents.scenes[0 if best is None else best.scene]

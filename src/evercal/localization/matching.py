@@ -56,8 +56,11 @@ class Matcher:
             if len(self._bank.pattern(keyframes)) > 0:
                 candidates.append(Candidate(scene, keyframes, 1, thorough=True))
             else:
-                stride = attempt.stride
-                candidates.append(Candidate(scene, keyframes, stride, thorough))
+                candidates.append(
+                    Candidate(
+                        scene, keyframes, attempt.stride, thorough, attempt.tolerance
+                    )
+                )
         return candidates
 
     def _votes(self, encoded: Encoded, proposed: IntArray) -> IntArray:

@@ -20,6 +20,8 @@ class Attempt(NamedTuple):
     """Every n-th row and column of patches is matched."""
     scale: float = 1.0
     """Scale of the encoded image, relative to the encoder's working size."""
+    tolerance: float = 1.0
+    """Factor on the threshold of RANSAC: from nearby, a patch of a keyframe covers several."""
     when: When = "always"
     """After earlier attempts with few or many PnP inliers, see `LocalizeOptions.aligned_inliers`.
     The first attempt always runs."""
@@ -34,7 +36,7 @@ class LocalizeOptions:
     attempts: tuple[Attempt, ...] = (
         Attempt(12, 4),
         Attempt(12, 2),
-        Attempt(48, 1, when="many inliers"),
+        Attempt(48, 1, tolerance=2.5, when="many inliers"),
         Attempt(12, 3, 1.6, when="few inliers"),
     )
     """Attempts in order, until a pose is final. An image with few inliers is magnified: the scene
@@ -45,7 +47,7 @@ class LocalizeOptions:
     """Minimum gain in similarity of a rotated image. Occlusion causes smaller ones."""
     aligned_inliers: int = 12
     """Number of PnP inliers that are many; with fewer, other orientations and sizes are tried."""
-    immediate: float = 4.0
+    immediate: float = 2.0
     """A pose with this many times the required support is final. Others are aligned again to the
     keyframes that see most of their view."""
     reselect_gain: float = 1.1
@@ -90,7 +92,7 @@ def _require_attempts(attempts: Sequence[Attempt]) -> None:
         raise InputError("LocalizeOptions.attempts is empty; it has one or more")
     for attempt in attempts:
         require_numbers(attempt, ("retrieved", "stride"), 1)
-        require_numbers(attempt, ("scale",), 0.1, 10)
+        require_numbers(attempt, ("scale", "tolerance"), 0.1, 10)
         if attempt.when not in get_args(When):
             allowed = ", ".join(get_args(When))
             raise InputError(

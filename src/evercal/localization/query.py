@@ -74,3 +74,5 @@ class Candidate(NamedTuple):
     """Every n-th row and column of patches is matched."""
     thorough: bool = False
     """Whether more patches are matched than at first: after a retry, or of repeated texture."""
+    tolerance: float = 1.0
+    """See `Attempt.tolerance`."""

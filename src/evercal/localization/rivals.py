@@ -3,7 +3,9 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
-from evercal.localization.acceptance import FULL_SUPPORT
+import numpy as np
+
+from evercal.localization.acceptance import APART_SIGMAS
 from evercal.localization.answer import differ
 from evercal.localization.hypothesis import Aligned, accepted
 from evercal.localization.intrinsics import FOCAL_FACTORS, zoomed
@@ -14,6 +16,9 @@ from evercal.localization.scene_poses import ScenePoses
 
 _NEXT_FOCAL = 0.09
 """Half of the step between `FOCAL_FACTORS`, logarithm."""
+
+_TOLERANCE = 2.5
+"""Factor on the threshold of RANSAC for rivals of a pose with little support."""
 
 
 def settled(
@@ -89,13 +94,19 @@ def _rivals(poses: ScenePoses, query: Query, best: Aligned) -> Iterator[Aligned]
     """
     camera = best.camera.short_side_resized(poses.contents.short_side)
     pose = best.pose.pose
-    rest = best.matches.beside(camera, pose, poses.options.rival_px)
+    candidate = best.candidate
+    matches = best.matches
+    if not accepted(best, poses.options.immediate):
+        candidate = candidate._replace(stride=1, tolerance=_TOLERANCE)
+        matches = poses.matcher.matches(query, candidate, camera)
+    rest = matches.beside(camera, pose, poses.options.rival_px)
     if len(rest.pixels) >= poses.options.aligned_inliers:
-        left_over = poses.hypothesis(query, best.candidate, rest)
+        left_over = poses.hypothesis(query, candidate, rest)
         if isinstance(left_over, Aligned):
             yield replace(left_over, matches=best.matches)
     stated = query.priors[best.scene].kind not in ("unknown", "not stated")
-    if not stated and best.support < FULL_SUPPORT:
+    deviation = float(np.sqrt(best.measured[0, 0]))
+    if not stated and APART_SIGMAS * deviation > _NEXT_FOCAL:
         yield from _other_focal_lengths(poses, query, best)
     for step in poses.slips(best):
         start = displaced(pose, step)

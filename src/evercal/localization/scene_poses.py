@@ -40,7 +40,7 @@ class ScenePoses:
         camera = query.camera(scene).short_side_resized(self.contents.short_side)
         if matches is None:
             matches = self.matcher.matches(query, candidate, camera)
-        solution = self._solved(query.priors[scene], candidate, matches, camera)
+        solution = self._solved(query, candidate, matches, camera)
         if solution is None:
             return None
         pnp, factor = solution
@@ -65,14 +65,19 @@ class ScenePoses:
 
     def _solved(
         self,
-        prior: IntrinsicsPrior,
+        query: Query,
         candidate: Candidate,
         matches: Matches,
         camera: Camera,
     ) -> tuple[PnpResult, float] | None:
         """The PnP pose with the most inliers, and its factor on the focal length."""
+        prior = query.priors[candidate.scene]
         unknown = prior.kind == "unknown"
-        options = replace(self.options.pnp, progressive_sampling=not unknown)
+        options = replace(
+            self.options.pnp,
+            threshold_px=candidate.tolerance * self.options.pnp.threshold_px,
+            progressive_sampling=not unknown,
+        )
         best = solve_pnp(*matches, camera, options)
         factor = 1.0
         many = best is not None and best.inlier_count >= self.options.aligned_inliers
