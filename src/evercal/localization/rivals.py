@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from evercal.localization.acceptance import APART_SIGMAS
+from evercal.localization.acceptance import APART_SIGMAS, FULL_SUPPORT
 from evercal.localization.answer import differ
 from evercal.localization.hypothesis import Aligned, accepted
 from evercal.localization.intrinsics import FOCAL_FACTORS, zoomed
@@ -106,7 +106,8 @@ def _rivals(poses: ScenePoses, query: Query, best: Aligned) -> Iterator[Aligned]
             yield replace(left_over, matches=best.matches)
     stated = query.priors[best.scene].kind not in ("unknown", "not stated")
     deviation = float(np.sqrt(best.measured[0, 0]))
-    if not stated and APART_SIGMAS * deviation > _NEXT_FOCAL:
+    undecided = APART_SIGMAS * deviation > _NEXT_FOCAL
+    if not stated and undecided and best.support < FULL_SUPPORT:
         yield from _other_focal_lengths(poses, query, best)
     for step in poses.slips(best):
         start = displaced(pose, step)
