@@ -44,6 +44,7 @@ VERBS = {
     "refresh": ("changing_room", "a map in a rendered room that changes in ten rounds"),
     "same-answers": ("same_answers", "answers of this tree, beside a commit's"),
     "speed": ("speed", "time of learning, localization and SARS"),
+    "tracking": ("tracking", "streams: wrong poses, ellipsoids, CPU time of a frame"),
     "serve": ("serve", "latency of the HTTP service"),
     "retrieval": (
         "retrieval",

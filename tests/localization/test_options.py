@@ -22,7 +22,7 @@ from evercal.localization.tracking import TrackOptions
         (LocalizeOptions, {"attempts": ()}),
         (LocalizeOptions, {"attempts": (Attempt(12, 4), Attempt(0, 4))}),
         (LocalizeOptions, {"attempts": (Attempt(12, 4, when="never"),)}),  # pyright: ignore[reportArgumentType]
-        (TrackOptions, {"keyframes": 0}),
+        (TrackOptions, {"checked": 0}),
         (TrackOptions, {"at_most_ms": -1.0}),
         (PnpOptions, {"max_iterations": 0}),
         (AlignmentOptions, {"min_matches": 0}),

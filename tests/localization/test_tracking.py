@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evercal.features.views import working_grey
 from evercal.geometry import SE3, UncertainPose, pose_distance
 from evercal.localization import tracking
 from evercal.localization.estimate import PoseEstimate
+from evercal.localization.image_motion import followed
 from evercal.localization.localizer import Localizer
 from evercal.localization.scene_poses import ScenePoses
 from evercal.localization.tracking import Tracker, TrackOptions
@@ -69,7 +71,7 @@ def test_a_jump_is_located_from_nothing(
     tracker = Tracker(Localizer(hall_map))
     for image, _ in views[:4]:
         tracker.track(image)
-    far = hall.test[1]
+    far = hall.test[-1]
     frame = tracker.track(far.read_image())
     assert frame.state == "relocalized"
     assert frame.estimate.base_from_camera is not None
@@ -116,6 +118,105 @@ def test_a_pose_that_is_too_uncertain_is_not_tracked(
     monkeypatch.setattr(tracking, "answer", useless)
     frame = tracker.track(views[3][0])
     assert (frame.state, frame.estimate.status) == ("relocalized", "ok")
+
+
+def test_a_camera_that_turns_by_degrees_is_never_tracked_to_another_minimum(
+    hall: Recording,
+    hall_map: MapContents,
+    hall_room: BoxRoom,
+    views: list[tuple[np.ndarray, SE3]],
+) -> None:
+    # Far beyond what alignment reaches: patches slide to other texture, and some poses passed.
+    rng = np.random.default_rng(3)
+    camera = hall.train[0].camera
+    tracker = Tracker(Localizer(hall_map))
+    states: list[str] = []
+    for _, pose in views[:10]:
+        turn = np.deg2rad(2.5) * rng.choice([-1, 1], 3)
+        shaken = pose @ SE3.exp(np.r_[0, 0, 0, turn])
+        frame = tracker.track(hall_room.render(camera, shaken))
+        assert frame.estimate.base_from_camera is not None
+        assert pose_distance(frame.estimate.base_from_camera, shaken)[0] < 0.005
+        states.append(frame.state)
+    assert states.count("tracking") > 5
+
+
+def test_fewer_inliers_than_in_the_frames_before_are_no_tracked_pose(
+    hall_map: MapContents, views: list[tuple[np.ndarray, SE3]]
+) -> None:
+    tracker = Tracker(Localizer(hall_map))
+    for image, _ in views[:3]:
+        tracker.track(image)
+    covered = views[3][0].copy()
+    covered[:, :140] = 128
+    assert tracker.track(covered).state == "relocalized"
+    assert tracker.track(covered).state == "tracking"
+
+
+def test_every_nth_frame_is_located_from_nothing_and_replaces_a_wrong_pose(
+    hall_map: MapContents,
+    views: list[tuple[np.ndarray, SE3]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tracker = Tracker(Localizer(hall_map), options=TrackOptions(checked=3))
+    searched: list[int] = []
+    located = Localizer.located
+
+    def counted(*given: Any) -> Any:
+        searched.append(tracker._number - 1)
+        return located(*given)
+
+    monkeypatch.setattr(Localizer, "located", counted)
+    frames = [tracker.track(image) for image, _ in views[:8]]
+    assert searched == [0, 3, 6]
+    assert {frame.state for frame in frames[1:]} == {"tracking"}
+    answer = tracking.answer
+
+    def wrong(*given: Any) -> PoseEstimate:
+        estimate = answer(*given)
+        aside = SE3.from_translation([0.02, 0, 0])
+        assert estimate.base_from_camera is not None
+        return replace(estimate, base_from_camera=aside @ estimate.base_from_camera)
+
+    monkeypatch.setattr(tracking, "answer", wrong)
+    states = [tracker.track(image).state for image, _ in views[8:11]]
+    assert states == ["tracking", "relocalized", "tracking"]
+
+
+def test_frames_do_not_inherit_the_intrinsics_that_one_of_them_mistook(
+    hall_map: MapContents, views: list[tuple[np.ndarray, SE3]]
+) -> None:
+    tracker = Tracker(Localizer(hall_map))
+    for image, _ in views[:4]:
+        tracker.track(image)
+    tracker._changes[-1] = np.array([0.1, 40.0, 0.0, 0.0, 0.0])
+    frame = tracker.track(views[4][0])
+    assert frame.state == "tracking"
+    assert frame.estimate.base_from_camera is not None
+    assert pose_distance(frame.estimate.base_from_camera, views[4][1])[0] < 0.003
+
+
+def test_landmarks_are_followed_from_image_to_image(
+    hall_map: MapContents,
+    hall: Recording,
+    views: list[tuple[np.ndarray, SE3]],
+) -> None:
+    localizer = Localizer(hall_map)
+    (first, _), (second, truth) = views[0], views[3]
+    _, pose = localizer.located(first)
+    assert pose is not None
+    small = hall_map.short_side
+    before, after = (working_grey(image, small) for image in (first, second))
+    camera = hall.train[0].camera.short_side_resized(small)
+    start = pose.pose.pose
+    found = followed(before, pose, after, camera, start)
+    assert found is not None
+    scene = hall_map.scenes[0]
+    truth = scene.frame.from_base(truth)
+    assert pose_distance(start, truth)[0] > 0.01
+    assert pose_distance(found, truth)[0] < 0.005
+    assert followed(before, pose, np.zeros_like(after), camera, start) is None
+    assert followed(before, pose, after[:-1], camera, start) is None
 
 
 def test_a_long_gap_and_time_that_runs_backwards_are_no_prediction(

@@ -16,6 +16,11 @@ from evercal.reports.answers import unit_known
 if TYPE_CHECKING:
     from evercal.localization.tracking import TrackedFrame
 
+FEW_FRAMES = 10
+"""Number of frames below which motion is not judged."""
+MOST_UNTRACKED = 1 / 3
+"""Share of frames that are not tracked above which the motion is too fast."""
+
 
 @dataclass(frozen=True)
 class Track(args.Verb):
@@ -94,7 +99,7 @@ class Track(args.Verb):
         tracked = states["tracking"]
         relocalized = states["relocalized"]
         lost = states["lost"]
-        record = {
+        record: dict[str, object] = {
             "frames": len(times),
             "tracking": tracked,
             "relocalized": relocalized,
@@ -107,10 +112,18 @@ class Track(args.Verb):
             f"{len(times)} frames: {tracked} tracked, {relocalized} relocalized, {lost} lost;"
             f" {middle:.0f} ms (median), {high:.0f} ms (99 %)"
         )
+        lines = [line]
+        untracked = relocalized + lost
+        if len(times) >= FEW_FRAMES and untracked > MOST_UNTRACKED * len(times):
+            lines.append(
+                f"warning: {untracked} of {len(times)} frames are not tracked: the view changes too"
+                " much from frame to frame; give more frames a second, or move more slowly"
+            )
+        record["warnings"] = lines[1:]
         then: tuple[object, ...] = ()
         if not self.out:
             then = ("track", self.store, self.source, "--out", "track.jsonl")
-        self.answer(record, line, then=then)
+        self.answer(record, *lines, then=then)
 
 
 def _line(name: str, frame: "TrackedFrame", unit_known: bool) -> str:

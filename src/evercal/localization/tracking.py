@@ -1,9 +1,11 @@
-"""`Tracker`: the camera poses of a stream; the last pose and its motion are the prior.
+"""`Tracker`: the camera poses of a stream; the last pose and the motion in the image are the prior.
 
-A tracked frame is not encoded and not matched: landmarks of the keyframes next to the predicted
-pose are aligned at once. The pose must pass the same acceptance as that of a single image. A frame
-that does not is located from nothing, and so is one before repeated texture whose prediction leaves
-several periods open.
+A tracked frame is not encoded and not matched. The landmarks of the last image are followed by
+optical flow, which predicts the pose to a pixel, and the landmarks of the map are aligned there.
+Such a pose is no chance of a search, so it has a law of its own: it agrees with the motion in the
+image, and about as many landmarks agree with it as in the frames before. Other frames are located
+from nothing, and so are those before repeated texture whose prediction leaves several periods open.
+Every n-th frame is located from nothing as well, and its pose replaces one that contradicts it.
 """
 
 import time
@@ -15,16 +17,19 @@ from typing import Literal
 import numpy as np
 
 from evercal.errors import require_numbers
+from evercal.features.views import working_grey
 from evercal.geometry import SE3, Camera, pose_distance
+from evercal.localization.acceptance import APART_SIGMAS
 from evercal.localization.answer import answer
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.hypothesis import Aligned, Hypothesis, accepted
+from evercal.localization.image_motion import followed
 from evercal.localization.intrinsics import INTRINSICS
 from evercal.localization.localizer import Localizer
 from evercal.localization.query import Candidate
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import as_rgb
-from evercal.typing import Array, Image, IntArray
+from evercal.typing import Array, Image
 
 TrackState = Literal["tracking", "relocalized", "lost"]
 _Located = tuple[PoseEstimate, Hypothesis | None]
@@ -39,24 +44,25 @@ MOST_SPEED_M_S = 1.0
 """Maximum speed of a camera that a prediction allows for; faster ones are rare on arms."""
 MOST_ACCELERATION_M_S2 = 10.0
 """Maximum acceleration of a camera that a prediction allows for."""
+MOST_MOVED_PX = 1.0
+"""Maximum median distance of landmarks from where their motion in the image predicts them, pixels
+at working size. From farther away alignment may end in another minimum (research/streams.md)."""
+LEAST_OF_RATIO = 0.75
+"""Minimum inlier ratio, relative to the highest one since a frame was located from nothing."""
+MOST_CHANGES = 15
+"""Number of frames, the median of whose intrinsics the next one starts with."""
 
 
 @dataclass(frozen=True)
 class TrackOptions:
     """How a stream is tracked."""
 
-    keyframes: int = 4
-    """Number of keyframes next to the predicted pose that are aligned."""
+    checked: int = 16
+    """Every n-th tracked frame in turn is also located from nothing."""
     fallback_s: float = 1 / 15
     """Time between frames without stamps, seconds."""
     longest_gap_s: float = 0.5
     """After a longer gap, seconds, the frame is located from nothing."""
-    reach_m: float = 0.10
-    """A pose that is farther from its prediction, metres, is verified by locating the frame."""
-    reach_deg: float = 8.0
-    """The same for the rotation, degrees."""
-    settled: float = 2.0
-    """Minimum support of the last pose, relative to the threshold, for using it as a prior."""
     at_most_ms: float | None = None
     """Time for a frame, milliseconds; what alignment misses is located in the background, `lost`
     meanwhile."""
@@ -66,9 +72,9 @@ class TrackOptions:
     """Jumps above this many sigmas reset the smoothing."""
 
     def __post_init__(self) -> None:
-        require_numbers(self, ("keyframes",), 1)
-        require_numbers(self, ("fallback_s", "longest_gap_s", "smooth"), 0)
-        require_numbers(self, ("reach_m", "reach_deg", "settled", "jump_sigmas"), 0)
+        require_numbers(self, ("checked",), 1)
+        numbers = ("fallback_s", "longest_gap_s", "smooth", "jump_sigmas")
+        require_numbers(self, numbers, 0)
         if self.at_most_ms is not None:
             require_numbers(self, ("at_most_ms",), 0)
 
@@ -81,13 +87,24 @@ class TrackedFrame:
     """From 0."""
     stamp_s: float
     state: TrackState
-    """`tracking`: located near its prediction. `relocalized`: located from nothing. `lost`: no
-    pose."""
+    """`tracking`: located near its prediction. `relocalized`: located from nothing, without a
+    prediction or against it. `lost`: no pose."""
     estimate: PoseEstimate
     smoothed: SE3 | None = None
     """base_from_camera, smoothed; None where lost or without smoothing."""
     jumped: bool = False
     """Whether the smoothed pose was reset to this measurement."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Running:
+    """A frame that is located in the background."""
+
+    image: Image
+    stamp: float
+    tracked: PoseEstimate | None
+    """Its tracked pose, which is checked."""
+    future: Future[_Located]
 
 
 @dataclass(eq=False)
@@ -101,15 +118,20 @@ class Tracker:
     _scene: int = -1
     _poses: list[tuple[float, SE3]] = field(default_factory=list)
     """Times and poses map_from_camera of the last two frames."""
-    _change: Array = field(default_factory=lambda: np.zeros(INTRINSICS))
-    """(5,) change of the intrinsics of the last frame."""
+    _changes: list[Array] = field(default_factory=list)
+    """Changes (5,) of the intrinsics of the last frames."""
+    _ratio: float = 0.0
+    """Highest inlier ratio since the last frame that was located from nothing, and its own."""
+    _last: tuple[Image, Hypothesis] | None = None
+    """The last located image, at working size, and its pose."""
+    _unchecked: int = 0
+    """Frames since one was located from nothing."""
     _smoothed: tuple[float, SE3] | None = None
     _number: int = 0
     _alignment_s: float = 0.0
     """Time of the last alignment."""
     _pool: ThreadPoolExecutor | None = None
-    _running: tuple[float, Future[_Located]] | None = None
-    """Time of a frame that is located in the background, and its result."""
+    _running: "_Running | None" = None
 
     def track(self, image: np.ndarray, stamp_s: float | None = None) -> TrackedFrame:
         """Locate the next frame, an image as for `Localizer.localize`, at a time in seconds.
@@ -149,21 +171,39 @@ class Tracker:
                 yield self.track(item)
 
     def _located(self, image: Image, stamp: float) -> tuple[PoseEstimate, TrackState]:
-        estimate = self._near_prediction(image, stamp)
-        if estimate is not None:
-            return estimate, "tracking"
-        before = self._poses[-1:]
-        predicted = self._predicted(stamp)
-        scene = self._scene
-        estimate, pose = self.localizer.located(image, self.camera)
-        self._poses.clear()
+        tracked = self._near_prediction(image, stamp)
+        self._unchecked += 1
+        if tracked is not None and self._unchecked < self.options.checked:
+            return tracked, "tracking"
+        located = self.localizer.located(image, self.camera)
+        if tracked is not None and self._confirmed(tracked, located[0]):
+            return tracked, "tracking"
+        return self._relocalized(image, stamp, located)
+
+    def _relocalized(
+        self, image: Image, stamp: float, located: _Located
+    ) -> tuple[PoseEstimate, TrackState]:
+        """Go on from the pose of a frame that was located from nothing."""
+        estimate, pose = located
+        self._unchecked = 0
+        self._ratio = 0.0
         if estimate.status != "ok" or pose is None:
+            self._poses.clear()
             return estimate, "lost"
-        self._remember(pose, stamp)
-        same = bool(self._poses) and self._scene == scene
-        if predicted is not None and same and self._trusted(pose, predicted, 1.0):
-            self._poses = [*before, *self._poses]  # the motion goes on
+        self._remember(pose, stamp, image)
         return estimate, "relocalized"
+
+    def _confirmed(self, tracked: PoseEstimate, alone: PoseEstimate) -> bool:
+        """Whether the location of a frame from nothing does not contradict its tracked pose."""
+        pose = tracked.uncertain_pose
+        other = alone.uncertain_pose
+        if pose is not None and other is not None:
+            squares = pose.squared_mahalanobis(other.pose)
+            if tracked.scene != alone.scene or squares > APART_SIGMAS**2:
+                return False
+        self._unchecked = 0
+        self._ratio = tracked.inlier_ratio
+        return True
 
     def _located_in_time(
         self, image: Image, stamp: float, until: float
@@ -171,90 +211,92 @@ class Tracker:
         """The same until a time of the clock; what takes longer goes on in the background."""
         began = time.perf_counter()
         adopted = self._adopted(until)
-        estimate = self._near_prediction(image, stamp, until, adopted)
-        if estimate is not None:
-            if adopted:
-                return estimate, "relocalized"
-            return estimate, "tracking"
-        self._poses.clear()
-        if self._running is None:
+        tracked = self._near_prediction(image, stamp)
+        self._unchecked += 1
+        due = tracked is None or self._unchecked >= self.options.checked
+        started = due and self._running is None
+        if started:
             self._pool = self._pool or ThreadPoolExecutor(1, "search")
             future = self._pool.submit(self.localizer.located, image, self.camera)
-            self._running = stamp, future
+            self._running = _Running(image, stamp, tracked, future)
+        if tracked is not None:
+            if adopted:
+                return tracked, "relocalized"
+            return tracked, "tracking"
+        self._poses.clear()
+        if started:
             finished = self._finished(until - _ANSWER_S)
             if finished is not None:
-                estimate, pose = finished[1]
-                if estimate.status != "ok" or pose is None:
-                    return estimate, "lost"
-                self._remember(pose, stamp)
-                return estimate, "relocalized"
+                return self._relocalized(image, stamp, finished.future.result())
         spent = 1000 * (time.perf_counter() - began)
         searching = PoseEstimate.failed(_SEARCHING, spent)
         return replace(searching, omitted=("localization",)), "lost"
 
-    def _finished(self, until: float) -> tuple[float, _Located] | None:
-        """Time and result of the frame in the background; None if it is not ready in time."""
-        if self._running is None:
+    def _finished(self, until: float) -> "_Running | None":
+        """The frame in the background; None if it is not located in time."""
+        running = self._running
+        if running is None:
             return None
-        stamp, future = self._running
-        if not wait([future], max(until - time.perf_counter(), 0.0)).done:
+        if not wait([running.future], max(until - time.perf_counter(), 0.0)).done:
             return None
         self._running = None
-        return stamp, future.result()
+        return running
 
     def _adopted(self, until: float) -> bool:
-        """Whether the frame in the background was located, so that its pose is the prior."""
+        """Whether the pose of the frame in the background is the prior from now on."""
         finished = self._finished(until - _MARGIN * self._alignment_s)
         if finished is None:
             return False
-        stamp, (estimate, pose) = finished
-        if estimate.status != "ok" or pose is None:
+        located = finished.future.result()
+        tracked = finished.tracked
+        if tracked is not None and self._poses and self._confirmed(tracked, located[0]):
             return False
-        self._remember(pose, stamp, settled=True)
-        return True
+        _, state = self._relocalized(finished.image, finished.stamp, located)
+        return state == "relocalized"
 
-    def _near_prediction(
-        self,
-        image: Image,
-        stamp: float,
-        until: float = np.inf,
-        adopted: bool = False,
-    ) -> PoseEstimate | None:
-        """Align the landmarks around the predicted pose; None if that does not suffice.
-
-        The pose of an earlier frame that is `adopted` is farther away and was not confirmed: the
-        search is coarse, and the pose needs the support of a settled one.
-        """
+    def _near_prediction(self, image: Image, stamp: float) -> PoseEstimate | None:
+        """Follow the landmarks of the last image and align; None if that does not suffice."""
         began = time.perf_counter()
         predicted = self._predicted(stamp)
-        if predicted is None:
+        if predicted is None or self._last is None:
             return None
-        times = 1.0
-        searches = [False, True]
-        if adopted:
-            times = self.options.settled
-            searches = [True]
-        query = self.localizer.query(image, self.camera)
-        candidate = Candidate(self._scene, self._next_keyframes(predicted))
-        for coarse in searches:
-            start = time.perf_counter()
-            if coarse and not adopted and start + _MARGIN * self._alignment_s > until:
-                return None
-            pose = self.localizer.poses.aligned(
-                query, candidate, predicted, self._change, coarse
-            )
-            self._alignment_s = time.perf_counter() - start
-            if pose is None or not self._trusted(pose, predicted, times):
-                continue
-            if self._may_have_slipped(pose, predicted, stamp):
-                return None
-            milliseconds = 1000 * (time.perf_counter() - began)
-            estimate = answer(pose, self._map, image.shape[:2], milliseconds)
-            if estimate.status != "ok":  # too uncertain to be useful
-                return None
-            self._remember(pose, stamp)
-            return estimate
-        return None
+        localizer = self.localizer
+        query = localizer.query(image, self.camera)
+        # A stream has one camera: the next frame must not inherit the mistake of a single one.
+        change = np.median(self._changes, axis=0)
+        camera = query.camera(self._scene).changed(change)
+        small = camera.short_side_resized(localizer.contents.short_side)
+        start = followed(*self._last, self._small(image), small, predicted)
+        if start is None:
+            return None
+        seen = localizer.poses.bank.seen(self._scene, start, camera)
+        candidate = Candidate(self._scene, seen[: localizer.options.keyframes])
+        pose = localizer.poses.aligned(query, candidate, start, change, coarse=False)
+        self._alignment_s = time.perf_counter() - began
+        if pose is None or not self._trusted(pose, start, small):
+            return None
+        if self._may_have_slipped(pose, predicted, stamp):
+            return None
+        milliseconds = 1000 * (time.perf_counter() - began)
+        estimate = answer(pose, self._map, image.shape[:2], milliseconds)
+        if estimate.status != "ok":  # too uncertain to be useful
+            return None
+        self._remember(pose, stamp, image)
+        return estimate
+
+    def _trusted(self, pose: Aligned, start: SE3, camera: Camera) -> bool:
+        """Whether a pose is no local minimum: the law of poses that were not searched for."""
+        if not accepted(pose):
+            return False
+        if pose.inlier_ratio < LEAST_OF_RATIO * self._ratio:
+            return False
+        before = camera.project(start.inverse().apply(pose.points_m))
+        moved_px = np.median(np.linalg.norm(pose.pixels - before, axis=1))
+        return bool(moved_px < MOST_MOVED_PX)
+
+    def _small(self, image: Image) -> Image:
+        """An image at the size in which landmarks are followed."""
+        return working_grey(image, self.localizer.contents.short_side)
 
     def _may_have_slipped(self, pose: Aligned, predicted: SE3, stamp: float) -> bool:
         """Whether a pose that lies a period of repeated texture away is as near the prediction."""
@@ -293,31 +335,22 @@ class Tracker:
         step = (first.inverse() @ pose).log()
         return pose @ SE3.exp(share * step)
 
-    def _next_keyframes(self, pose: SE3) -> IntArray:
-        """Keyframes in the bank next to a pose, in metres and radians."""
-        first = 0
-        for scene in self.localizer.contents.scenes[: self._scene]:
-            first += len(scene.keyframes)
-        metres, radians = pose_distance(pose, self._map.keyframes.base_from_camera)
-        spread = max(float(np.median(metres)), 1e-6)
-        order = np.argsort(metres / spread + radians, kind="stable")
-        return first + order[: self.options.keyframes]
-
-    def _trusted(self, pose: Hypothesis, predicted: SE3, times: float) -> bool:
-        """Whether a pose has enough support and is near its prediction."""
-        if not accepted(pose, times):
-            return False
-        metres, radians = pose_distance(pose.pose.pose, predicted)
-        near = self._at_room_scale(float(metres)) < self.options.reach_m
-        return near and float(radians) < np.deg2rad(self.options.reach_deg)
-
-    def _remember(self, pose: Hypothesis, stamp: float, settled: bool = False) -> None:
-        self._scene = pose.scene
-        self._change = np.zeros(INTRINSICS)
+    def _remember(self, pose: Hypothesis, stamp: float, image: Image) -> None:
+        """Take a pose as that of the last frame."""
+        recent = []
+        for before in self._poses[-1:]:
+            if pose.scene == self._scene and stamp > before[0]:
+                recent.append(before)
+        if pose.scene != self._scene:
+            self._changes.clear()
+        change = np.zeros(INTRINSICS)
         if isinstance(pose, Aligned):
-            self._change = pose.change
-        if settled or self._poses or accepted(pose, self.options.settled):
-            self._poses = [*self._poses[-1:], (stamp, pose.pose.pose)]
+            change = pose.change
+        self._changes = [*self._changes, change][-MOST_CHANGES:]
+        self._scene = pose.scene
+        self._ratio = max(self._ratio, pose.inlier_ratio)
+        self._poses = [*recent, (stamp, pose.pose.pose)]
+        self._last = self._small(image), pose
 
     def _smooth(self, estimate: PoseEstimate, stamp: float) -> tuple[SE3 | None, bool]:
         """Return the smoothed pose, and whether it follows a jump."""
