@@ -180,6 +180,8 @@ def _row(answers: Sequence[Row], name: str) -> Row:
     apart = _column(answers, f"{name}_from_alone_m") > WRONG_M
     from_alone = _column(answers, f"{name}_from_alone_position_d2")
     apart &= from_alone > WRONG_SIGMAS**2
+    alone_wrong = _column(answers, "alone_m") > WRONG_M
+    alone_wrong &= _column(answers, "alone_position_d2") > WRONG_SIGMAS**2
     located = np.isfinite(d2)
     alone_d2 = _column(answers, "alone_d2")
     return {
@@ -190,6 +192,7 @@ def _row(answers: Sequence[Row], name: str) -> Row:
         "alone_lost": int(np.sum(_column(answers, "alone_status", str) != "ok")),
         "wrong": int((wrong & tracking_).sum()),
         "wrong_relocalized": int((wrong & ~tracking_).sum()),
+        "alone_wrong": int(alone_wrong.sum()),
         "apart": int((apart & tracking_).sum()),
         "far": int((far & tracking_).sum()),
         "median_mm": 1000 * float(np.nanmedian(metres)),

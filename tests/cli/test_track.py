@@ -1,8 +1,10 @@
 """`evercal track` on the command line."""
 
 import time
+from collections import Counter
 from collections.abc import Iterator
 
+from evercal.cli.track import Track
 from evercal.live import camera
 from evercal.recordings import streams
 
@@ -40,3 +42,13 @@ def test_a_live_camera_is_tracked_in_its_newest_frames(
     ran = run("track", hall_store, "0 --out", tmp_path / "t.jsonl", "--json")
     assert 1 <= ran.json["frames"] < 30
     assert ran.code == 0
+
+
+def test_motion_that_is_too_fast_is_warned_of(tmp_path, capsys):
+    verb = Track(tmp_path, "images")
+    verb._summary(Counter(tracking=6, relocalized=6), [20.0] * 12)
+    out = capsys.readouterr().out
+    assert "warning: 6 of 12 frames are located from nothing: the view changes" in out
+    verb._summary(Counter(tracking=11, relocalized=1), [20.0] * 12)
+    verb._summary(Counter(lost=12), [20.0] * 12)
+    assert "warning" not in capsys.readouterr().out

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 FEW_FRAMES = 10
 """Number of frames below which motion is not judged."""
-MOST_UNTRACKED = 1 / 3
-"""Share of frames that are not tracked above which the motion is too fast."""
+MOST_RELOCALIZED = 1 / 3
+"""Share of frames located from nothing above which the motion is too fast."""
 
 
 @dataclass(frozen=True)
@@ -113,11 +113,11 @@ class Track(args.Verb):
             f" {middle:.0f} ms (median), {high:.0f} ms (99 %)"
         )
         lines = [line]
-        untracked = relocalized + lost
-        if len(times) >= FEW_FRAMES and untracked > MOST_UNTRACKED * len(times):
+        if len(times) >= FEW_FRAMES and relocalized > MOST_RELOCALIZED * len(times):
             lines.append(
-                f"warning: {untracked} of {len(times)} frames are not tracked: the view changes too"
-                " much from frame to frame; give more frames a second, or move more slowly"
+                f"warning: {relocalized} of {len(times)} frames are located from nothing: the view"
+                " changes too much from frame to frame; give more frames a second, or move more"
+                " slowly"
             )
         record["warnings"] = lines[1:]
         then: tuple[object, ...] = ()
