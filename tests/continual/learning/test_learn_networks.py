@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -60,9 +60,8 @@ def test_reports_describe_the_store(learned: Learned) -> None:
     store = NetworkStore.open(learned.root)
     contents = store.contents
     assert [record.name for record in contents.scenes] == ["alpha", "beta"]
-    assert [
-        json.loads(json.dumps(asdict(r))) for r in learned.reports
-    ] == store.reports()
+    reports = [json.loads(json.dumps(report.to_dict())) for report in learned.reports]
+    assert reports == store.reports()
     for report, record, keyframes in zip(
         learned.reports, contents.scenes, contents.keyframes, strict=True
     ):
