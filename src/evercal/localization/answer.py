@@ -9,7 +9,7 @@ from evercal.geometry import SE3, UncertainPose, pose_distance, pose_distance_mm
 from evercal.localization import acceptance
 from evercal.localization.estimate import CovarianceTerm, PoseEstimate
 from evercal.localization.hypothesis import Aligned, Hypothesis, accepted
-from evercal.localization.lack_of_fit import WARPED, LackOfFit, lack_of_fit
+from evercal.localization.lack_of_fit import WARPED, LackOfFit, lack_of_fit, unlikely
 from evercal.mapping.scene_map import SceneMap
 from evercal.typing import Array
 
@@ -163,6 +163,14 @@ def _useless(
             f"the image is mirrored: its mirror image has support {mirrored:.1f},"
             f" the image {best.support:.1f}"
         )
+    if isinstance(best, Aligned):
+        camera = best.camera
+        less = best.support - unlikely(camera, best.change)
+        if less < -math.log10(acceptance.FALSE_ACCEPTS):
+            return (
+                f"it needs a principal point at ({camera.cx:.0f}, {camera.cy:.0f}) of"
+                f" {camera.width}x{camera.height} px: give the whole image as the camera took it"
+            )
     if misfit is not None and misfit.size * math.sqrt(widening(best)) > WARPED:
         return misfit.reason
     if scene.at_room_scale(position) <= acceptance.USELESS_M:

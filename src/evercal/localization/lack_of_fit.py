@@ -7,6 +7,7 @@ Computation, 1992). What the pose absorbs of a displacement is not in the residu
 of the coefficients widens the covariance of the pose, and a large one rejects the image.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -100,6 +101,15 @@ def lack_of_fit(
         covariance=in_parent_axes(pose.rotation_matrix(), covariance),
         reason=_reason(coefficients, sizes, camera),
     )
+
+
+def unlikely(camera: Camera, change: Array) -> float:
+    """-log10 of the density of focal length and principal point among cameras, largest 1.
+
+    The support of a pose is less by it: a wrong pose needs an unlikely camera.
+    """
+    deviations = (change**2 / UNKNOWN.variances(camera))[:3]
+    return float(deviations.sum()) / (2 * math.log(10))
 
 
 def _reason(coefficients: Array, sizes: Array, camera: Camera) -> str:
