@@ -17,7 +17,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.accuracy import wrong
-from benchmarks.guard_recordings import Case, all_cases, write
+from benchmarks.guard_recordings import Case, all_cases, far_cases, write
 from benchmarks.rows import Row, grouped, median_of, numbers, once, save
 from benchmarks.same_answers import ROOT, source_of
 from benchmarks.same_model import INSIDE_95
@@ -33,6 +33,7 @@ def run(
     real: Path | None = None,
     beside: tuple[str, ...] = ("175b928",),
     only: str = "",
+    rendered: bool = True,
     cache: Path = Path("runs/guard"),
 ) -> None:
     """Compare this build with others on rooms that are not as rendered ones.
@@ -45,6 +46,7 @@ def run(
         real: Folder of real recordings with tsdf_room, redkitchen and fr1_rpy.
         beside: Commits to compare with.
         only: Part of the names of recordings that are learned.
+        rendered: Whether views of rendered rooms are measured, which needs Mitsuba.
         cache: Folder for recordings and the answers of every build.
 
     Raises:
@@ -52,7 +54,9 @@ def run(
     """
     if real is None:
         print("real rooms are left out: give their folder with --real")
-    listed = all_cases(real, cache.resolve() / "rendered")
+    listed = [*all_cases(real)]
+    if rendered:
+        listed += far_cases(cache.resolve() / "rendered")
     cases = [case for case in listed if only in case.learned]
     if not cases:
         raise InputError(f"--only {only}: no recording has such a name")
@@ -149,9 +153,9 @@ def summary(answers: Sequence[Row]) -> Row:
 
 def _difference(old: Row, now: Row) -> Row:
     """The numbers of a build less those of an older one."""
-    row: Row = dict(now)
-    for key, value in now.items():
-        before = old[key]
-        if not isinstance(value, str) and not isinstance(before, str):
-            row[key] = value - before
-    return row
+    more = {
+        key: value - float(old[key])
+        for key, value in now.items()
+        if not isinstance(value, str)
+    }
+    return now | more

@@ -98,5 +98,5 @@ def _exposure(pose: SE3, rng: np.random.Generator) -> SE3:
     """Poses during an exposure whose middle is the pose."""
     metres, degrees = TREMOR
     change = rng.normal(size=6) * np.repeat([metres, np.deg2rad(degrees)], 3)
-    shares = (np.arange(RENDER.blur_steps) + 0.5) / RENDER.blur_steps - 0.5
+    shares = np.linspace(-0.5, 0.5, RENDER.blur_steps)
     return SE3.stack([pose @ SE3.exp(share * change) for share in shares])

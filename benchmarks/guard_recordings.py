@@ -80,12 +80,11 @@ class Case:
         return next(iter(self.make))
 
 
-def all_cases(real: Path | None, rendered: Path) -> Iterator[Case]:
-    """List what is measured.
+def all_cases(real: Path | None) -> Iterator[Case]:
+    """List what is measured beside rendered rooms.
 
     Args:
         real: Folder of real recordings.
-        rendered: Folder for images of rendered rooms.
     """
     scenes = [room.scene for room in sample_rooms()]
     others = [(scene, "10%") for scene in scenes]
@@ -99,6 +98,10 @@ def all_cases(real: Path | None, rendered: Path) -> Iterator[Case]:
         yield from _packaged(scene)
     for scene, memory in others:
         yield _other_cameras(scene, memory)
+
+
+def far_cases(rendered: Path) -> Iterator[Case]:
+    """List rendered rooms, whose images are kept in a folder."""
     for kind in ROOMS:
         make = partial(far_room, kind, rendered)
         yield Case("far views", {f"far-{kind}": make}, "20%")
@@ -166,12 +169,12 @@ def _write_frame(stem: str, frame: Frame) -> None:
 
 
 def _stated(recording: Recording, camera: Camera) -> Recording:
-    train = _with_camera(recording.train, camera)
-    return replace(recording, train=train, test=_with_camera(recording.test, camera))
-
-
-def _with_camera(frames: Sequence[Frame], camera: Camera) -> tuple[Frame, ...]:
-    return tuple(replace(frame, camera=camera) for frame in frames)
+    """A recording with other intrinsics."""
+    parts = (recording.train, recording.test)
+    train, test = (
+        tuple(replace(frame, camera=camera) for frame in part) for part in parts
+    )
+    return replace(recording, train=train, test=test)
 
 
 def _spread(frames: Sequence[Frame], count: int) -> tuple[Frame, ...]:
@@ -257,21 +260,16 @@ def _with_rolling_shutter(
 def _middle(scene: Recording) -> Recording:
     """The middle of all images, so that views of other cameras fit into them."""
     train = tuple(seen(frame, np.zeros(4)) for frame in scene.train)
-    test = tuple(seen(frame, np.zeros(4)) for frame in _asked(scene))
-    return replace(scene, train=train, test=test)
+    return replace(_other_camera(scene, (0.0, 0.0, 0.0)), train=train)
 
 
 def _other_camera(scene: Recording, change: tuple[float, float, float]) -> Recording:
     """Test images of another camera, see `OTHERS`, stated as the recording's."""
     focal, x, y = change
     test = []
-    for frame in _asked(scene):
+    for frame in _spread(posed_frames(scene.test), OTHER_IMAGES):
         own = seen(frame, np.zeros(4)).camera
         width = frame.camera.width
         other = seen(frame, np.array([focal, x / width, y / width, 0.0]))
         test.append(replace(other, camera=own))
     return replace(scene, train=(), test=tuple(test))
-
-
-def _asked(scene: Recording) -> tuple[Frame, ...]:
-    return _spread(posed_frames(scene.test), OTHER_IMAGES)

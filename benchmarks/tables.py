@@ -235,6 +235,19 @@ def _range(values: Table, digits: int) -> str:
 
 
 _ROOMS = "scenes (memory 10 %)"
+
+
+def _guard() -> Table:
+    """Numbers of an older build and of this one, for each recording."""
+    builds = [of for _, of in rows_of("guard").groupby("build", sort=False)]
+    old, now = builds[:2]
+    table = now[["recording", "n"]].astype(str)
+    for key in ("2_cm", "1_cm", "refused", "inside_position", "inside_pose", "wrong"):
+        before = old[key].map("{:.3g} → ".format).to_numpy()
+        table[key.replace("_", " ")] = before + now[key].map("{:.3g}".format)
+    return table
+
+
 TABLES: dict[str, Callable[[], Table]] = {
     "results: rooms and real recordings": _accuracy(
         _ROOMS,
@@ -291,6 +304,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "fisheye: lenses": _rows(
         "answer,rooms,map,asked,number,located,mm,mm_90,inside_95,wrong", "fisheye"
     ),
+    "real-rooms: guard": _guard,
     "intrinsics: another camera of the model": _rows(
         "answer,camera,stated,answers,located,median_mm,95_%_mm,sigma_mm,inside_95_%,wrong",
         "same-model",

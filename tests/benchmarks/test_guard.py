@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.guard import summary
-from benchmarks.guard_recordings import all_cases, write
+from benchmarks.guard_recordings import all_cases, far_cases, write
 from benchmarks.rows import Row
 from evercal.recordings import load_recording
 from evercal.recordings.frame import Recording
@@ -36,7 +36,8 @@ def test_recordings_are_read_as_they_were_written(
 
 
 def test_names_of_recordings_are_unique(tmp_path: Path) -> None:
-    names = [name for case in all_cases(None, tmp_path) for name in case.make]
+    cases = [*all_cases(None), *far_cases(tmp_path)]
+    names = [name for case in cases for name in case.make]
     assert len({*names}) == len(names)
     assert "stabilised-living-3px" in names
 

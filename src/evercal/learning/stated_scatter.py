@@ -6,7 +6,7 @@ about the map.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -169,9 +169,10 @@ def scatter(errors: Array, covariances: Array) -> float:
         return float((np.log(variances) + squares / variances).sum()) / 2
 
     largest = 2 * float(np.sqrt(squares.sum(1).max()))
-    best = float(
-        minimize_scalar(unlikeliness, bounds=(0.0, largest), method="bounded").x
+    minimum: Any = minimize_scalar(
+        unlikeliness, bounds=(0.0, largest), method="bounded"
     )
+    best = float(minimum.x)
     least = unlikeliness(best)
 
     def excess(sigma: float) -> float:

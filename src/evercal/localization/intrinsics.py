@@ -175,9 +175,13 @@ class RecordedScene(Protocol):
         """The same camera after learning."""
         ...
 
+
+class MovingScene(RecordedScene, Protocol):
+    """A scene that states how far the intrinsics of its camera move."""
+
     @property
     def intrinsics_sigma(self) -> tuple[float, float, float]:
-        """How far its intrinsics move from image to image."""
+        """From image to image, see `SceneMap.intrinsics_sigma`."""
         ...
 
 
@@ -216,7 +220,7 @@ def _is_own(camera: Camera, scene: RecordedScene) -> bool:
 
 
 def prior_of(
-    camera: Camera | None, image: Image, scene: RecordedScene
+    camera: Camera | None, image: Image, scene: MovingScene
 ) -> IntrinsicsPrior:
     """Prior of the intrinsics of an image: stated, the recording's, or unknown."""
     prior = _stated_prior(camera, image, scene)

@@ -47,7 +47,7 @@ class LocalizeOptions:
     """Minimum gain in similarity of a rotated image. Occlusion causes smaller ones."""
     aligned_inliers: int = 12
     """Number of PnP inliers that are many; with fewer, other orientations and sizes are tried."""
-    immediate: float = 2.0
+    immediate: float = 3.0
     """A pose with this many times the required support is final. Others are aligned again to the
     keyframes that see most of their view."""
     reselect_gain: float = 1.1
