@@ -84,9 +84,8 @@ def self_calibrated(
     moving[:3, 3:] = 0
     moving[3:, :3] = 0
     lens += moving
-    noise = best.covariance(np.zeros(0), cells)
     return RefinedPose(
-        pose=best.pose(noise + lens),
+        pose=best.pose(best.covariance(np.zeros(0), cells) + lens),
         observed=observed,
         residual_px=best.residual_px,
         camera=best.camera,

@@ -190,7 +190,7 @@ class Tracker:
         if estimate.status != "ok" or pose is None:
             self._poses.clear()
             return estimate, "lost"
-        self._remember(pose, stamp, image)
+        self._remember(pose, stamp, self._small(image))
         return estimate, "relocalized"
 
     def _confirmed(self, tracked: PoseEstimate, alone: PoseEstimate) -> bool:
@@ -266,7 +266,8 @@ class Tracker:
         change = np.median(self._changes, axis=0)
         camera = query.camera(self._scene).changed(change)
         small = camera.short_side_resized(localizer.contents.short_side)
-        start = followed(*self._last, self._small(image), small, predicted)
+        grey = self._small(image)
+        start = followed(*self._last, grey, small, predicted)
         if start is None:
             return None
         seen = localizer.poses.bank.seen(self._scene, start, camera)
@@ -281,7 +282,7 @@ class Tracker:
         estimate = answer(pose, self._map, image.shape[:2], milliseconds)
         if estimate.status != "ok":  # too uncertain to be useful
             return None
-        self._remember(pose, stamp, image)
+        self._remember(pose, stamp, grey)
         return estimate
 
     def _trusted(self, pose: Aligned, start: SE3, camera: Camera) -> bool:
@@ -335,8 +336,8 @@ class Tracker:
         step = (first.inverse() @ pose).log()
         return pose @ SE3.exp(share * step)
 
-    def _remember(self, pose: Hypothesis, stamp: float, image: Image) -> None:
-        """Take a pose as that of the last frame."""
+    def _remember(self, pose: Hypothesis, stamp: float, grey: Image) -> None:
+        """Take a pose as that of the last frame; `grey` is its image at working size."""
         recent = []
         for before in self._poses[-1:]:
             if pose.scene == self._scene and stamp > before[0]:
@@ -350,7 +351,7 @@ class Tracker:
         self._scene = pose.scene
         self._ratio = max(self._ratio, pose.inlier_ratio)
         self._poses = [*recent, (stamp, pose.pose.pose)]
-        self._last = self._small(image), pose
+        self._last = grey, pose
 
     def _smooth(self, estimate: PoseEstimate, stamp: float) -> tuple[SE3 | None, bool]:
         """Return the smoothed pose, and whether it follows a jump."""
