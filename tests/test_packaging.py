@@ -110,7 +110,17 @@ def test_the_licence_of_every_package_is_listed() -> None:
     }
     for extras in (
         (),
-        ("serve", "bags", "colmap", "lerobot", "networks", "ray", "urdf", "view"),
+        (
+            "bags",
+            "boards",
+            "colmap",
+            "lerobot",
+            "networks",
+            "ray",
+            "serve",
+            "urdf",
+            "view",
+        ),
     ):
         everything = brought("evercal", frozenset(extras), {})
         assert everything.keys() - {"evercal"} <= listed

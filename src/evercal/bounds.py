@@ -4,6 +4,7 @@ Whoever writes a file or sends a request decides how much work it makes. So size
 the work: in headers before bodies, and before patterns, tables and decoders.
 """
 
+import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +18,10 @@ from evercal.errors import InputError
 Kind = TypeVar("Kind", bound="Bounds")
 VARIABLE = "EVERCAL_LIMITS"
 """Environment variable `NAME=NUMBER,...` of changed bounds; worker processes inherit it."""
+
+
+class TooLargeError(InputError):
+    """More than a bound allows; status 413 of the service."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,8 @@ class Bounds:
     """Numbers of an array, and cells of a table."""
     pixels: int = 100_000_000
     """Pixels of an image."""
+    aspect: int = 5
+    """Longer side of an image, as a multiple of its shorter side."""
 
 
 @dataclass(frozen=True)
@@ -73,12 +80,12 @@ class RequestBounds(Bounds):
     """Slowest body."""
 
 
-_in_force: ContextVar[type[Bounds]] = ContextVar("_in_force", default=Bounds)
+_of_request: ContextVar[RequestBounds | None] = ContextVar("_of_request", default=None)
 
 
 def bounds() -> Bounds:
     """The bounds in force: the default ones, changed by `EVERCAL_LIMITS`."""
-    return _changed(_in_force.get(), os.environ.get(VARIABLE, ""))
+    return _of_request.get() or _changed(Bounds, os.environ.get(VARIABLE, ""))
 
 
 def request_bounds() -> RequestBounds:
@@ -87,13 +94,13 @@ def request_bounds() -> RequestBounds:
 
 
 @contextmanager
-def reading_a_request() -> Iterator[None]:
-    """Bound what is read inside as a part of a request."""
-    token = _in_force.set(RequestBounds)
+def reading_a_request(limits: RequestBounds | None = None) -> Iterator[None]:
+    """Bound what is read inside as a part of a request; by default with `request_bounds`."""
+    token = _of_request.set(limits or request_bounds())
     try:
         yield
     finally:
-        _in_force.reset(token)
+        _of_request.reset(token)
 
 
 @cache
@@ -123,3 +130,16 @@ def require_at_most(count: int, name: str, what: str) -> None:
             f"{count:,} {what}, at most {most:,} are read; if it is right, add `limits`"
             f" {name}={count}"
         )
+
+
+def require_image_size(width: int, height: int, name: str = "image") -> None:
+    """Refuse an image with too many pixels, or with one side far longer than the other.
+
+    The shorter side is resized to the working size, so the longer one decides the memory.
+    """
+    aspect = max(width, height) / max(1, min(width, height))
+    try:
+        require_at_most(width * height, "pixels", "pixels")
+        require_at_most(math.ceil(aspect), "aspect", "times longer than wide")
+    except ValueError as error:
+        raise TooLargeError(f"{name} ({width}x{height}): {error}") from None

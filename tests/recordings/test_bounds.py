@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import io
 import json
+import struct
 import time
 import tracemalloc
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from evercal.bounds import VARIABLE, bounds, reading_a_request
+from evercal.bounds import VARIABLE, TooLargeError, bounds, reading_a_request
 from evercal.calibration.calibration import read_calibration
 from evercal.calibration.export.request import read_link_from_optical
 from evercal.errors import InputError
 from evercal.recordings import read_image, read_robot_poses, write_image
 from evercal.recordings.cameras.camera_file import read_camera
-from evercal.recordings.images import as_rgb
+from evercal.recordings.formats.video_file import Videos
+from evercal.recordings.images import as_rgb, decode_image, is_readable
+from evercal.recordings.streams import stream
 from evercal.storage.text_files import natural_key
 
 Read = Callable[[Path], object]
@@ -147,15 +150,16 @@ def test_a_pose_table_takes_little_time_and_memory(
         refused(read_robot_poses, tmp_path / name, content, message)
 
 
-def npz(shape: tuple[int, ...], **more: Any) -> bytes:
-    """An archive of one array of ones that states a shape."""
+def npz(shape: tuple[int, ...], arrays: int = 1) -> bytes:
+    """An archive of arrays that state a shape."""
     array = io.BytesIO()
     file = io.BytesIO()
     np.lib.format.write_array_header_1_0(
         array, {"shape": shape, "fortran_order": False, "descr": "<f8"}
     )
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("poses.npy", array.getvalue() + bytes(8_000))
+        for i in range(arrays):
+            archive.writestr(f"poses{i}.npy", array.getvalue() + bytes(8_000))
     return file.getvalue()
 
 
@@ -164,6 +168,8 @@ def test_arrays_are_measured_before_they_are_read(tmp_path: Path, read: Read) ->
     with frugal(seconds=5, megabytes=20):
         message = "200,000,000 numbers, at most 10,000,000"
         refused(read, tmp_path / "a.npz", npz((2 * 10**8,)), message)
+        many = npz((6 * 10**6,), arrays=2)
+        refused(read, tmp_path / "a.npz", many, "12,000,000 numbers, at most")
 
 
 def test_the_bounds_are_raised_by_the_variable(
@@ -206,10 +212,62 @@ def test_an_image_that_opencv_refuses_is_one_line(
 
     write_image(tmp_path / "a.png", np.zeros((4, 4, 3), np.uint8))
     monkeypatch.setattr(cv2, "imdecode", refuse)
-    with pytest.raises(
-        InputError, match=r"at most 100,000,000 pixels.* `limits` pixels=NUMBER"
-    ):
+    with pytest.raises(InputError, match=r"a.png: not a readable image \(79 bytes\)"):
         read_image(tmp_path / "a.png")
+
+
+def png_header(width: int, height: int) -> bytes:
+    """A PNG file that ends after its header."""
+    header = struct.pack(">II5B", width, height, 8, 2, 0, 0, 0)
+    chunk = b"IHDR" + header
+    checksum = struct.pack(">I", zlib.crc32(chunk))
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + checksum
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "message"),
+    [
+        (20_000, 20_000, "400,000,000 pixels, at most 100,000,000 are read"),
+        (60_000, 1, "60,000 times longer than wide, at most 5 are read"),
+        (100, 501, "6 times longer than wide"),
+    ],
+)
+def test_the_size_in_the_header_of_an_image_is_bounded(
+    tmp_path: Path, width: int, height: int, message: str
+) -> None:
+    content = png_header(width, height)
+    with frugal(seconds=1, megabytes=5):
+        refused(
+            read_image,
+            tmp_path / "a.png",
+            content,
+            f"a.png .{width}x{height}.: {message}",
+        )
+        assert not is_readable(tmp_path / "a.png")
+        with pytest.raises(TooLargeError, match=message):
+            decode_image(np.frombuffer(content, np.uint8))
+
+
+def test_an_array_is_bounded_like_a_file() -> None:
+    strip = np.zeros((1, 240, 3), np.uint8)
+    with pytest.raises(InputError, match=r"image \(240x1\): 240 times longer"):
+        as_rgb(strip)
+    assert as_rgb(np.zeros((100, 500), np.uint8)).shape == (100, 500, 3)
+
+
+def test_a_frame_of_a_video_is_bounded_before_it_is_converted(tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    with av.open(tmp_path / "a.mp4", "w") as container:
+        out = container.add_stream("mpeg4", rate=10)
+        out.width = 384
+        out.height = 16
+        out.pix_fmt = "yuv420p"
+        frame = av.VideoFrame.from_ndarray(np.zeros((16, 384, 3), np.uint8))
+        container.mux([*out.encode(frame), *out.encode()])
+    with pytest.raises(InputError, match=r"a.mp4 \(384x16\): 24 times"):
+        Videos(fps=10).frame(tmp_path / "a.mp4", 0)
+    with pytest.raises(InputError, match=r"a.mp4 \(384x16\): 24 times"):
+        next(stream(str(tmp_path / "a.mp4")))
 
 
 def test_names_are_sorted_by_their_numbers_whatever_they_hold() -> None:

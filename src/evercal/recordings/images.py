@@ -1,5 +1,6 @@
 """Images on disk and in memory: (H, W, 3) uint8 in the order red, green, blue."""
 
+import io
 import re
 import zlib
 from abc import ABC, abstractmethod
@@ -9,10 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
+import imagesize
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evercal.bounds import bounds
+from evercal.bounds import require_image_size
 from evercal.errors import InputError
 from evercal.storage.atomic import write_bytes
 from evercal.storage.text_files import named_errors, natural_key
@@ -124,10 +126,11 @@ def is_readable(image: Path | Image) -> bool:
 
     Of a PNG the checksums are compared, which takes a tenth of the time.
     """
-    with suppress(OSError, ValueError):  # ValueError: the file is empty
+    with suppress(OSError, ValueError, InputError):  # ValueError: the file is empty
         if isinstance(image, Path):
             image = np.memmap(image, mode="r")
         data = np.asarray(image)
+        require_image_size(*size_in_header(data))
         return _is_whole_png(data) or decode_image(data) is not None
     return False
 
@@ -178,6 +181,7 @@ def as_rgb(image: ArrayLike) -> Image:
             f"image: array of shape {pixels.shape} and type {pixels.dtype}; give (H, W) grey,"
             f" (H, W, 3) RGB or (H, W, 4) RGBA as uint8 or uint16"
         )
+    require_image_size(pixels.shape[1], pixels.shape[0])
     if pixels.dtype == np.uint16:
         import cv2
 
@@ -197,19 +201,27 @@ def read_image(path: PathLike, turned: bool = True) -> Image:
     path = Path(path)
     with named_errors(path, "image file"):
         data = np.fromfile(path, dtype=np.uint8)
-    image = decode_image(data, turned)
+    image = decode_image(data, turned, str(path))
     if image is None:
         raise InputError(
-            f"{path}: not a readable image ({data.size} bytes) of at most {bounds().pixels:,}"
-            " pixels; use PNG or JPEG, or add `limits` pixels=NUMBER"
+            f"{path}: not a readable image ({data.size} bytes); use PNG or JPEG"
         )
     return image
 
 
-def decode_image(data: Image, turned: bool = True) -> Image | None:
-    """Decode (n,) uint8 bytes of an image file as by `read_image`; None if they are no image."""
+def decode_image(data: Image, turned: bool = True, name: str = "image") -> Image | None:
+    """Decode (n,) uint8 bytes of an image file as by `read_image`; None if they are no image.
+
+    Raises:
+        TooLargeError: By the size in the header, before anything is decoded.
+    """
     import cv2
 
+    try:
+        size = size_in_header(data)
+    except ValueError:
+        return None
+    require_image_size(*size, name)
     # IMREAD_UNCHANGED would ignore the orientation; ANYDEPTH keeps 16 bits for as_rgb to round.
     # IMREAD_COLOR_RGB leaves the pixels of a TIFF of 16 bits as they were in memory.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
@@ -229,6 +241,21 @@ def decode_image(data: Image, turned: bool = True) -> Image | None:
     if image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
     return as_rgb(image)
+
+
+def size_in_header(data: Image) -> tuple[int, int]:
+    """Width and height by the header of an image file, (n,) uint8 bytes; not turned.
+
+    Raises:
+        ValueError: The bytes are no image.
+    """
+    with suppress(
+        Exception
+    ):  # broken headers raise whatever their format's reader does
+        width, height = imagesize.get(io.BytesIO(data.tobytes()), exif_rotation=False)
+        if width > 0 and height > 0:
+            return width, height
+    raise ValueError("no image")
 
 
 def image_file(data: bytes) -> ImageFile | None:

@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from evercal.bounds import require_image_size
 from evercal.errors import InputError
 from evercal.recordings.image_files import image_files
-from evercal.recordings.images import read_image
+from evercal.recordings.images import as_rgb, read_image
 from evercal.recordings.poses.row_files import times_in_names
 from evercal.typing import Image
 
@@ -77,6 +78,9 @@ def _captured(source: str) -> Iterator[StreamFrame]:
         raise InputError(
             f"{source}: cannot be opened as a video; check path, address and codec"
         )
+    width = capture.get(cv2.CAP_PROP_FRAME_WIDTH)
+    height = capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
+    require_image_size(int(width), int(height), source)
     return _frames_of(capture, is_live(source))
 
 
@@ -99,7 +103,7 @@ def _frames_of(capture: Any, live: bool) -> Iterator[StreamFrame]:
                 stamp = time.time()
             else:
                 stamp = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            image = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
+            image = as_rgb(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
             yield StreamFrame(str(number), stamp, image, arrived)
             number += 1
     finally:

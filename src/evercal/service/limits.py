@@ -1,51 +1,35 @@
 """What a request may contain: sizes, images, and small files such as intrinsics."""
 
-import io
 import tempfile
-import warnings
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
-from PIL import Image
 
-from evercal.bounds import RequestBounds, reading_a_request, request_bounds
+from evercal.bounds import (
+    RequestBounds,
+    TooLargeError,
+    reading_a_request,
+    request_bounds,
+)
 from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.cameras.camera_file import read_camera
-from evercal.recordings.images import decode_image
+from evercal.recordings.images import decode_image, size_in_header
 from evercal.recordings.poses.pairing import poses_of_images
 
-Image.preinit()
 Content = TypeVar("Content")
-_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
-"""Formats of images, as Pillow names them."""
-
-
-class TooLargeError(InputError):
-    """More than a limit allows; status 413."""
 
 
 def decoded(data: bytes, name: str, limits: RequestBounds) -> np.ndarray:
-    """Pixels (h, w, 3) uint8 RGB of an image file.
-
-    The size in the file's header is checked before anything is decoded.
-    """
-    width, height = _header_size(data, name)
-    if width * height > limits.pixels:
-        raise TooLargeError(
-            f"{name}: {width}x{height} pixels; at most {limits.pixels:,} in all"
-        )
-    try:
-        image = decode_image(np.frombuffer(data, np.uint8))
-    except cv2.error:
-        image = None
-    if image is None or image.shape[0] * image.shape[1] > limits.pixels:
-        raise InputError(f"{name}: not a readable image ({len(data)} bytes)")
+    """Pixels (h, w, 3) uint8 RGB of an image file, see `decode_image`."""
+    with reading_a_request(limits):
+        image = decode_image(np.frombuffer(data, np.uint8), name=name)
+    if image is None:
+        raise _unreadable(data, name)
     return image
 
 
@@ -89,16 +73,15 @@ class Sent(Sequence[tuple[str, np.ndarray]]):
 
 def _header_size(data: bytes, name: str) -> tuple[int, int]:
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about images that the caller refuses
-            with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
-                return image.size
-    except Image.DecompressionBombError:
-        raise TooLargeError(f"{name}: too many pixels") from None
-    except Exception:  # every format raises errors of its own for broken headers
-        raise InputError(
-            f"{name}: not a readable image ({len(data)} bytes); send PNG, JPEG, BMP, TIFF or WebP"
-        ) from None
+        return size_in_header(np.frombuffer(data, np.uint8))
+    except ValueError:
+        raise _unreadable(data, name) from None
+
+
+def _unreadable(data: bytes, name: str) -> InputError:
+    return InputError(
+        f"{name}: not a readable image ({len(data)} bytes); send PNG, JPEG, BMP, TIFF or WebP"
+    )
 
 
 @lru_cache(maxsize=8)  # a robot sends the same intrinsics with every image

@@ -18,13 +18,12 @@ from fastapi.security import HTTPBearer
 from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
 
-from evercal.bounds import RequestBounds, request_bounds
+from evercal.bounds import RequestBounds, TooLargeError, request_bounds
 from evercal.errors import InputError
 from evercal.service import hosts, routes
 from evercal.service.connection import protocols
 from evercal.service.desk import Desk
 from evercal.service.guard import PAGES, Guard, Metrics
-from evercal.service.limits import TooLargeError
 from evercal.service.live_map import LiveMap
 
 POLL_S = 0.5

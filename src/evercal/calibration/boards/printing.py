@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evercal.calibration.boards.board import Board, dictionary_of
-from evercal.errors import InputError
+from evercal.errors import InputError, optional_module
 from evercal.typing import Array, Image
 
 if TYPE_CHECKING:
@@ -87,18 +87,17 @@ def _cells(board: Board) -> int:
 
 def drawing(board: Board, paper: str = "a4") -> "tuple[PillowImage, float]":
     """Draw a board on a sheet, with a ruler; also return the resolution in pixels per inch."""
-    from PIL import Image
-
+    pillow = optional_module("PIL.Image", "printing a board needs Pillow", "boards")
     unit_mm = 1000 * board.size_m / _cells(board)
     unit_px = max(1, round(unit_mm * _DPI / _MM_PER_INCH))
     px_per_mm = unit_px / unit_mm
     picture = board_image(board, unit_px)
     size_mm = np.array(picture.shape[::-1]) / px_per_mm
     width, height = _sheet(board, paper, size_mm)
-    sheet = Image.new("1", (round(width * px_per_mm), round(height * px_per_mm)), 1)
+    sheet = pillow.new("1", (round(width * px_per_mm), round(height * px_per_mm)), 1)
     left = (sheet.width - picture.shape[1]) // 2
     top = (sheet.height - round(_FOOTER_MM * px_per_mm) - picture.shape[0]) // 2
-    sheet.paste(Image.fromarray(picture), (left, top))
+    sheet.paste(pillow.fromarray(picture), (left, top))
     _draw_footer(
         sheet,
         f"{_RULER_MM} mm: {label(board)}",

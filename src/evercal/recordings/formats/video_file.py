@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from evercal.bounds import require_image_size
 from evercal.errors import InputError, optional_module
 from evercal.recordings.images import StoredImage
 from evercal.typing import Image
@@ -53,6 +54,7 @@ class _Open:
                 return None
         if self.last.time > seconds + half:
             return None
+        require_image_size(self.last.width, self.last.height, self.container.name)
         return self.last.to_ndarray(format="rgb24")
 
 

@@ -19,12 +19,14 @@ def arrays_as_lists(path: Path) -> Any:
             return _matlab(file)
         if zipfile.is_zipfile(file):
             with zipfile.ZipFile(file) as archive:
+                count = 0
                 for entry in archive.infolist():
                     with archive.open(entry) as member:
-                        _require_few_numbers(member)
+                        count += _numbers_of(member)
         else:
             file.seek(0)
-            _require_few_numbers(file)
+            count = _numbers_of(file)
+        require_at_most(count, "numbers", "numbers")
         file.seek(0)
         loaded = np.load(file, allow_pickle=False)
         if isinstance(loaded, np.ndarray):
@@ -48,8 +50,8 @@ def _matlab(file: IO[bytes]) -> dict[str, Any]:
     return {name: loaded[name].tolist() for name in names}
 
 
-def _require_few_numbers(file: IO[bytes]) -> None:
-    """Check the shape that an array states, before its numbers are read."""
+def _numbers_of(file: IO[bytes]) -> int:
+    """Count of numbers by the shape that an array states."""
     if np.lib.format.read_magic(file) == (1, 0):
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)
     else:
@@ -57,5 +59,4 @@ def _require_few_numbers(file: IO[bytes]) -> None:
     if dtype.hasobject:
         raise ValueError("Python objects; save arrays of numbers")
     words = max(dtype.itemsize, 8)
-    size = math.prod(shape) * words // 8
-    require_at_most(size, "numbers", "numbers")
+    return math.prod(shape) * words // 8
