@@ -44,6 +44,8 @@ class Bounds:
     """Pixels of an image."""
     aspect: int = 5
     """Longer side of an image, as a multiple of its shorter side."""
+    tensor_header_bytes: int = 1_000_000
+    """Header of a safetensors file."""
 
 
 @dataclass(frozen=True)

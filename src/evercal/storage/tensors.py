@@ -1,5 +1,11 @@
 """Named arrays in safetensors files."""
 
+import errno
+import json
+import math
+import os
+import resource
+import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -8,8 +14,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.bounds import bounds
 from evercal.errors import InputError
 from evercal.storage.atomic import write_bytes
+
+_LENGTH = 8
+"""Bytes of the length of a header, which stands before it."""
+_KINDS = {
+    "BOOL": "?",
+    "U8": "u1",
+    "I8": "i1",
+    "U16": "<u2",
+    "I16": "<i2",
+    "F16": "<f2",
+    "U32": "<u4",
+    "I32": "<i4",
+    "F32": "<f4",
+    "U64": "<u8",
+    "I64": "<i8",
+    "F64": "<f8",
+}
+"""Types of numbers by their names in a header."""
 
 
 def save_tensors(
@@ -27,51 +52,136 @@ def save_tensors(
 
 def load_tensors(path: Path) -> dict[str, NDArray[np.generic]]:
     """Read the named arrays of a file."""
+    from safetensors import SafetensorError
     from safetensors.numpy import load
 
     with _reading(path):
-        return load(path.read_bytes())
+        try:
+            return load(path.read_bytes())
+        except SafetensorError as error:
+            raise ValueError(error) from None
+
+
+class _OpenFile:
+    """A file that is read by offset, until nobody holds it.
+
+    It is not mapped into memory: where another program truncates a mapped file, the kernel ends
+    the process.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._descriptor = _descriptor(path)
+        weakref.finalize(self, os.close, self._descriptor)
+        self._opened = self._state()
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file when it was opened."""
+        return self._opened[0]
+
+    def read(self, start: int, into: NDArray[Any]) -> None:
+        """Fill an array with the bytes from an offset on."""
+        left = into.reshape(-1).view(np.uint8).data
+        while left and (count := os.preadv(self._descriptor, [left], start)):
+            start += count
+            left = left[count:]
+        if left or self._state() != self._opened:
+            raise ValueError(
+                "it was overwritten in place while it was open; replace a map by 'mv'"
+            )
+
+    def _state(self) -> tuple[int, int]:
+        status = os.fstat(self._descriptor)
+        return status.st_size, status.st_mtime_ns
 
 
 class StoredRows:
-    """The rows of an array in a mapped file: a slice of them is copied.
+    """The rows of an array in an open file: a slice of them is read when it is asked for."""
 
-    Unlike those of the library, slices may be empty everywhere.
-    """
-
-    def __init__(self, file: Any, name: str):
-        self._rows = file.get_slice(name)
-        shape = self._rows.get_shape()
-        self._count = shape[0]
-        if 0 in shape:
-            self._rows = file.get_tensor(name)
+    def __init__(self, file: _OpenFile, start: int, kind: str, shape: list[int]):
+        self._file = file
+        self._start = start
+        self._kind = np.dtype(kind)
+        self._count, *self._shape = shape
 
     def __len__(self) -> int:
         return self._count
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
         start, stop, _ = rows.indices(self._count)
-        if start >= stop:
-            return self._rows[:0]
-        return self._rows[start:stop]
+        count = max(stop - start, 0)
+        array = np.empty((count, *self._shape), self._kind)
+        if array.size:
+            row_bytes = array.nbytes // count
+            with _reading(self._file.path):
+                self._file.read(self._start + start * row_bytes, array)
+        return array
 
 
 def open_tensors(path: Path) -> dict[str, StoredRows]:
-    """The named arrays of a file, one or more dimensions each, which stays mapped into memory."""
-    from safetensors import safe_open
-
+    """The named arrays of a file, one or more dimensions each, which stays open."""
     with _reading(path):
-        file = safe_open(path, "np")
-        return {name: StoredRows(file, name) for name in file.keys()}  # noqa: SIM118
+        file = _OpenFile(path)
+        entries, begin = _header(file)
+        arrays = {}
+        for name, entry in entries.items():
+            if name != "__metadata__":
+                arrays[name] = _stored(file, begin, name, entry)
+        return arrays
+
+
+def _header(file: _OpenFile) -> tuple[dict[str, Any], int]:
+    """What the header says of each array, and the offset behind it."""
+    length = np.zeros(1, "<u8")
+    if file.size < _LENGTH:
+        raise ValueError("it is too short")
+    file.read(0, length)
+    count = int(length[0])
+    if count > min(bounds().tensor_header_bytes, file.size - _LENGTH):
+        raise ValueError(f"its header would have {count} bytes")
+    text = np.zeros(count, np.uint8)
+    file.read(_LENGTH, text)
+    entries = json.loads(text.tobytes())
+    if not isinstance(entries, dict):
+        raise ValueError("its header is no object")
+    return entries, _LENGTH + count
+
+
+def _stored(file: _OpenFile, begin: int, name: str, entry: Any) -> StoredRows:
+    """An array by its entry in the header, whose arrays begin at an offset."""
+    try:
+        kind = _KINDS[entry["dtype"]]
+        shape = list(entry["shape"])
+        first, last = entry["data_offsets"]
+    except (KeyError, TypeError, ValueError):
+        raise ValueError(f"{name!r} in its header is no array") from None
+    numbers = [*shape, first, last]
+    are_sizes = all(type(n) is int and 0 <= n <= file.size for n in numbers)
+    if not shape or not are_sizes or begin + last > file.size:
+        raise ValueError(f"{name!r} does not lie in the file")
+    if math.prod(shape) * np.dtype(kind).itemsize != last - first:
+        raise ValueError(f"{name!r} has not the size of its shape")
+    return StoredRows(file, begin + first, kind, shape)
+
+
+def _descriptor(path: Path) -> int:
+    try:
+        return os.open(path, os.O_RDONLY)
+    except OSError as error:
+        if error.errno != errno.EMFILE:
+            raise
+    # A map has as many files as scenes.
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    return os.open(path, os.O_RDONLY)
 
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    from safetensors import SafetensorError
-
     try:
         yield
-    except (OSError, SafetensorError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: not readable ({error}); run 'evercal info --check'"
         ) from None
