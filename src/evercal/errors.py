@@ -34,6 +34,10 @@ class InputError(Exception):
         return tuple(_FIELD.findall(str(self)))
 
 
+class UnavailableError(InputError):
+    """A map that cannot be read now; status 503 of the service."""
+
+
 def with_options(text: str) -> str:
     """A text for a terminal: `robot_poses` becomes --robot-poses."""
     return _FIELD.sub(lambda match: "--" + match[1].replace("_", "-"), text)

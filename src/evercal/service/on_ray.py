@@ -74,6 +74,7 @@ def serve_on_ray(
         raise InputError(f"`replicas` {replicas}: give a number >= 1")
     options = replace(options, map=options.map.absolute())
     scenes = Map.open(options.map).scenes
+    options = replace(options, known=bool(scenes))
     stop = threading.Event()
     with connected(address) as ray:
         from ray import serve

@@ -18,7 +18,7 @@ from fastapi import (
     UploadFile,
     WebSocket,
 )
-from fastapi.responses import PlainTextResponse, RedirectResponse
+from fastapi.responses import JSONResponse, PlainTextResponse, RedirectResponse
 from prometheus_client import generate_latest
 from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketDisconnect
@@ -101,9 +101,14 @@ async def index() -> Response:
 
 
 @router.get("/health")
-async def health(service: Asked) -> dict[str, Any]:
-    """Whether the service answers."""
-    return {"status": "ok", "scenes": len(service.live.current.scenes)}
+async def health(service: Asked) -> JSONResponse:
+    """Whether the service answers, and whether it can read the map."""
+    live = service.live
+    scenes = len(live.current.scenes)
+    status = 200
+    if live.fault is not None and not scenes:
+        status = 503
+    return JSONResponse({"status": live.status, "scenes": scenes}, status)
 
 
 @router.get("/scenes")
@@ -122,7 +127,7 @@ async def localize(
     intrinsics = await _content(camera)
 
     def work() -> dict[str, Any]:
-        localizer = service.live.current.localizer
+        localizer = service.live.localizer
         began = time.perf_counter()
         pixels = decoded(data, name, service.limits)
         estimate = localizer.localize(
@@ -177,7 +182,7 @@ async def calibrations(
     decode = await _images(service, images, camera, robot_poses)
 
     def work() -> dict[str, Any]:
-        return calibrate(service.live.current.localizer, decode(), mount).to_dict()
+        return calibrate(service.live.localizer, decode(), mount).to_dict()
 
     return await service.desk.run(work)
 
@@ -203,7 +208,7 @@ async def check(
         reference = calibration_of(content)
         given = decode()
         shift = drift.check(
-            service.live.current.localizer,
+            service.live.localizer,
             given.images,
             reference,
             given.camera,
@@ -248,7 +253,7 @@ async def track(socket: WebSocket, service: Asked) -> None:
 
     def row(data: bytes, name: str) -> dict[str, Any]:
         nonlocal tracker, tracked
-        localizer = service.live.current.localizer
+        localizer = service.live.localizer
         image = decoded(data, name, service.limits)
         # The map or the camera changed.
         if tracker is None or tracked != (localizer, intrinsics):

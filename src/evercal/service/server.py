@@ -19,7 +19,7 @@ from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
 
 from evercal.bounds import RequestBounds, TooLargeError, request_bounds
-from evercal.errors import InputError
+from evercal.errors import InputError, UnavailableError
 from evercal.service import hosts, routes
 from evercal.service.connection import protocols
 from evercal.service.desk import Desk
@@ -50,6 +50,8 @@ class ServeOptions:
     """Requests must have it as bearer token."""
     limits: RequestBounds = field(default_factory=request_bounds)
     """Sizes above which a request is refused."""
+    known: bool = False
+    """Whether there is a map already, so that a missing folder is a fault."""
 
 
 def make_app(
@@ -57,7 +59,7 @@ def make_app(
     on_ready: Callable[[tuple[str, ...]], object] = lambda _: None,
 ) -> FastAPI:
     """The application; `on_ready` gets the names of the scenes when requests are answered."""
-    live = LiveMap(options.map)
+    live = LiveMap(options.map, options.known)
     metrics = Metrics()
 
     @asynccontextmanager
@@ -108,7 +110,9 @@ async def _poll(live: LiveMap) -> None:
         await asyncio.to_thread(live.refresh)
 
 
-def _answer(_: Request, error: Exception) -> JSONResponse:
+def _answer(request: Request, error: Exception) -> JSONResponse:
+    if isinstance(error, UnavailableError):
+        request.app.state.service.live.distrust()
     if isinstance(error, HTTPException):
         return _line(error.detail, error.status_code, error.headers)
     if isinstance(error, RequestValidationError):
@@ -127,7 +131,7 @@ def _line(
     return JSONResponse({"error": routes.one_line(error)}, status, headers)
 
 
-_STATUS = {TooLargeError: 413, InputError: 400}
+_STATUS = {TooLargeError: 413, UnavailableError: 503, InputError: 400}
 """HTTP status of an error; the first kind that fits counts."""
 
 

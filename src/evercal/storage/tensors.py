@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.bounds import bounds
-from evercal.errors import InputError
+from evercal.errors import UnavailableError
 from evercal.storage.atomic import write_bytes
 
 _LENGTH = 8
@@ -182,6 +182,6 @@ def _reading(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(
+        raise UnavailableError(
             f"{path}: not readable ({error}); run 'evercal info --check'"
         ) from None
