@@ -76,6 +76,8 @@ class RequestBounds(Bounds):
     """Streams of frames among them."""
     frame_bytes: int = 8 * 10**6
     """A frame of a stream."""
+    stream_bytes: int = 32 * 10**6
+    """Frames of a stream that wait; the rest waits at the client."""
     wait_s: float = 10.0
     """Time for headers, for reading an answer, and for a body beyond its length, seconds."""
     bytes_per_s: float = 250_000.0

@@ -2,7 +2,9 @@
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +15,7 @@ from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.errors import InputError, missing_extra
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
+from evercal.localization.tracking import TrackedFrame
 from evercal.recordings.images import as_rgb
 from evercal.robot.mount import MountName
 from evercal.typing import PathLike
@@ -25,6 +28,19 @@ Part = tuple[str, bytes]
 """File name and content."""
 Parts = list[tuple[str, Part | str]]
 """Parts of a request by name."""
+
+_ANSWER_S = 0.2
+"""Time to wait for an answer before looking whether there are frames left, seconds."""
+
+
+@dataclass(frozen=True, eq=False)
+class StreamedFrame(TrackedFrame):
+    """A frame of a stream that a service has located; its number is that of the frame sent."""
+
+    waiting: int = 0
+    """Frames that wait in the service behind this one."""
+    dropped: int = 0
+    """Frames before this one that were dropped, see `Client.track`."""
 
 
 class Client:
@@ -47,6 +63,8 @@ class Client:
             raise missing_extra("a client needs urllib3", "serve") from None
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         self._url = url.rstrip("/")
+        self._headers = headers
+        self._timeout = timeout
         retries = urllib3.Retry(
             connect=2, read=0, redirect=0, status=0, other=0, backoff_factor=0.1
         )
@@ -71,6 +89,44 @@ class Client:
             *_json_part("camera", camera),
         ]
         return _estimate(self._ask("POST", "/localize", parts))
+
+    def track(
+        self,
+        frames: Iterable[np.ndarray | PathLike],
+        *,
+        camera: Camera | None = None,
+        newest: bool = False,
+    ) -> Iterator[StreamedFrame]:
+        """Locate the frames of one camera in order, see `Map.track`.
+
+        A thread sends the frames as they come, while answers are awaited.
+
+        Args:
+            frames: Images; they are sent as those of `localize` are.
+            camera: Intrinsics. Default: those of the camera that recorded the scene.
+            newest: Of the frames that wait in the service, drop all but the newest.
+
+        Yields:
+            State and answer of each frame that was not dropped.
+        """
+        from websockets.exceptions import WebSocketException
+        from websockets.sync.client import connect
+
+        url = self._url.replace("http", "ws", 1) + "/track" + "?newest=1" * newest
+        try:
+            # The service answers pings after the frames that were sent before.
+            with connect(
+                url,
+                additional_headers=self._headers,
+                open_timeout=self._timeout,
+                ping_timeout=None,
+            ) as socket:
+                if camera is not None:
+                    socket.send(json.dumps(camera.to_dict()))
+                yield from _answers(socket, _Sending(socket, frames))
+        except (OSError, WebSocketException) as error:
+            reason = " ".join(str(error).split())
+            raise InputError(f"{self._url}: no answer ({reason[:200]})") from None
 
     def calibrate(
         self,
@@ -127,6 +183,48 @@ class Client:
         if isinstance(content, dict):
             message = content.get("error") or message
         raise InputError(message)
+
+
+class _Sending(threading.Thread):
+    """Sends frames until there are no more."""
+
+    def __init__(self, socket: Any, frames: Iterable[np.ndarray | PathLike]):
+        super().__init__(daemon=True)
+        self.sent = 0
+        self.error: Exception | None = None
+        self._socket = socket
+        self._frames = frames
+
+    def run(self) -> None:
+        try:
+            for image in self._frames:
+                self._socket.send(_image_part(image, "")[1])
+                self.sent += 1
+        except Exception as error:
+            self.error = error
+
+
+def _answers(socket: Any, sending: _Sending) -> Iterator[StreamedFrame]:
+    sending.start()
+    answered = 0
+    while sending.is_alive() or answered < sending.sent:
+        try:
+            row = json.loads(socket.recv(_ANSWER_S))
+        except TimeoutError:
+            continue
+        if "error" in row:
+            raise InputError(row["error"])
+        answered = row["frame"] + 1
+        yield StreamedFrame(
+            row["frame"],
+            row["stamp_s"],
+            row["state"],
+            _estimate(row),
+            waiting=row["waiting"],
+            dropped=row["dropped"],
+        )
+    if sending.error is not None:
+        raise sending.error
 
 
 def _image_part(image: np.ndarray | PathLike, name: str) -> Part:

@@ -1,12 +1,16 @@
 """Connections of the service: bounded in number, and in the time until they ask something."""
 
 import asyncio
+import socket
 from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from evercal.bounds import RequestBounds
+
+_UNREAD_BYTES = 100_000
+"""Of a stream, in the buffer of its socket."""
 
 
 def protocols(
@@ -42,11 +46,31 @@ class _Patient:
 
 
 class _Stream(_Patient, WebSocketsSansIOProtocol):
-    """A stream that is closed if its handshake takes too long."""
+    """A stream that is closed if its handshake takes too long, or if its client is silent.
+
+    The answer to a ping comes after all frames that were sent before it.
+    """
+
+    received_s: float = 0.0
+    """When the client was heard last."""
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
         self.loop.call_later(self.bounds.wait_s, self._late)
+        # Pings of a client that sends too much wait behind what is in there.
+        own = transport.get_extra_info("socket")
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNREAD_BYTES)
+
+    def data_received(self, data: bytes) -> None:
+        self.received_s = self.loop.time()
+        super().data_received(data)
+
+    def keepalive_timeout(self) -> None:
+        if self.read_paused or self.received_s > self.ping_sent_at:
+            self.stop_keepalive()
+            self.start_keepalive()
+        else:
+            super().keepalive_timeout()
 
     def _late(self) -> None:
         if not self.handshake_complete:

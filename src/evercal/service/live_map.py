@@ -112,7 +112,7 @@ class LiveMap:
 
     def _probe(self, localizer: Localizer, manifest: Manifest) -> None:
         """Locate a keyframe of each scene that is not as it was in the last good state."""
-        checksums = {("", manifest.payload.get("short_side"))}
+        checksums: set[tuple[str, object]] = {("", manifest.payload.get("short_side"))}
         for file, record in manifest.files.items():
             checksums.add((file, record["sha256"]))
         changed = {file for file, _ in checksums - self._checksums}

@@ -1,9 +1,7 @@
 """The endpoints. Every request is answered from one state of the map."""
 
-import json
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,17 +19,13 @@ from fastapi import (
 from fastapi.responses import JSONResponse, PlainTextResponse, RedirectResponse
 from prometheus_client import generate_latest
 from starlette.requests import HTTPConnection
-from starlette.websockets import WebSocketDisconnect
 
 from evercal.bounds import RequestBounds
 from evercal.calibration import drift
 from evercal.calibration.from_images import calibrate
 from evercal.calibration.image_source import Images
-from evercal.errors import InputError
-from evercal.localization.localizer import Localizer
-from evercal.localization.tracking import Tracker
+from evercal.errors import InputError, UnavailableError
 from evercal.reports.answers import Answer, answer_row, check_record, unit_known
-from evercal.reports.track_files import track_row
 from evercal.robot.mount import MountName
 from evercal.service.desk import Desk
 from evercal.service.guard import Metrics
@@ -43,6 +37,7 @@ from evercal.service.limits import (
     poses_of,
 )
 from evercal.service.live_map import LiveMap
+from evercal.service.stream import Frame, StreamTracker, Waiting, answer_frames
 
 router = APIRouter()
 CameraFile = Annotated[
@@ -239,42 +234,26 @@ async def metrics(service: Asked) -> Response:
 
 
 @router.websocket("/track")
-async def track(socket: WebSocket, service: Asked) -> None:
+async def track(socket: WebSocket, service: Asked, newest: bool = False) -> None:
     """Frames in, rows out: each binary message is an image file, each answer a JSON row.
 
     Rows have the state of the tracking (`tracking`, `relocalized`, `lost`). A text message holds
     the intrinsics of the frames that follow, as `camera` of `/localize`. A frame that cannot be
-    used is answered with `{"error": ...}`.
+    used is answered with `{"error": ...}`. Frames wait in order; with `newest` only the newest
+    waits, and the others are dropped.
     """
-    intrinsics = None
-    number = 0
-    tracker: Tracker | None = None
-    tracked: tuple[Localizer, bytes | None] | None = None
+    waiting = Waiting(service.limits.stream_bytes, newest)
+    tracker = StreamTracker(lambda: service.live.localizer, service.limits)
 
-    def row(data: bytes, name: str) -> dict[str, Any]:
-        nonlocal tracker, tracked
-        localizer = service.live.localizer
-        image = decoded(data, name, service.limits)
-        # The map or the camera changed.
-        if tracker is None or tracked != (localizer, intrinsics):
-            tracker = Tracker(localizer, camera_of(intrinsics, image.shape[1::-1]))
-            tracked = (localizer, intrinsics)
-        frame = tracker.track(image, time.monotonic())
-        return track_row(frame, name, unit_known(localizer, frame.estimate.scene))
+    async def row(frame: Frame) -> dict[str, Any]:
+        try:
+            return await service.desk.run(tracker.row, frame)
+        except InputError as error:
+            if isinstance(error, UnavailableError):
+                service.live.distrust()
+            return {"path": frame.name, "error": one_line(error)}
 
-    await socket.accept()
-    with suppress(WebSocketDisconnect):
-        while (message := await socket.receive())["type"] != "websocket.disconnect":
-            if message.get("text") is not None:
-                intrinsics = message["text"].encode()
-                continue
-            name = f"frame {number}"
-            number = number + 1
-            try:
-                answer = await service.desk.run(row, message["bytes"], name)
-            except InputError as error:
-                answer = {"path": name, "error": one_line(error)}
-            await socket.send_text(json.dumps(answer, allow_nan=False))
+    await answer_frames(socket, waiting, row)
 
 
 def one_line(error: object) -> str:
