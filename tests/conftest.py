@@ -314,7 +314,8 @@ def full_disk(
                     return function(*args, **kwargs)
                 calls.append(function.__name__)
                 if len(calls) == last or (len(calls) > last and not once):
-                    raise OSError(28, "No space left on device")
+                    named = args[:1] if function.__name__ != "fsync" else ()
+                    raise OSError(28, "No space left on device", *named)
                 return function(*args, **kwargs)
 
             return call

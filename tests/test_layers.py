@@ -53,9 +53,9 @@ FOR_ALL = (
 FACES = ("__init__", "__main__")
 """Modules of the root that may import everything."""
 PRODUCT = ORDER[: ORDER.index("simulation")]
-MOST_LOCALIZING = 58
+MOST_LOCALIZING = 59
 """Modules of evercal that a program loads for localizing, at most."""
-MOST_LEARNING = 92
+MOST_LEARNING = 93
 """The same for learning."""
 
 

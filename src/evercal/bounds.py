@@ -44,6 +44,20 @@ class Bounds:
     """Pixels of an image."""
     aspect: int = 5
     """Longer side of an image, as a multiple of its shorter side."""
+    scans: int = 100
+    """Scans of a JPEG file; progressive files have about ten."""
+    depth: int = 50
+    """Levels of nesting in a YAML file."""
+    map_side: int = 4_000
+    """Side of an image of a map, pixels."""
+    manifest_bytes: int = 20_000_000
+    """Manifest of a map."""
+    archive_bytes: int = 20_000_000_000
+    """All files of an archive."""
+    archive_files: int = 200_000
+    """Entries of an archive."""
+    archive_ratio: int = 10
+    """Size of its files as a multiple of its own size; maps are packed uncompressed."""
     tensor_header_bytes: int = 1_000_000
     """Header of a safetensors file."""
 

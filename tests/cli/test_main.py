@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -168,7 +169,10 @@ def test_output_paths_are_refused_before_the_work(run, words, message, tmp_path)
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--version"], "No space left on device"),
+        (
+            ["--version"],
+            f"standard output or {tempfile.gettempdir()}: No space left on device",
+        ),
         (["info", "x", "--json"], "x: no such folder"),
     ],
 )

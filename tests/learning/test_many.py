@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -20,7 +21,9 @@ from evercal.features.encoder import ENCODER_FILE, load_encoder
 from evercal.learning.many import learn_scenes
 from evercal.learning.task import LearnTask
 from evercal.map import Map
+from evercal.mapping.manage import pack_map, remove_scenes, unpack_map
 from evercal.mapping.scene_map import MapContents
+from evercal.mapping.store import MapStore
 from evercal.recordings import Recording
 from evercal.recordings.images import StoredImage
 
@@ -108,6 +111,56 @@ def test_unusable_recordings_and_killed_workers_do_not_stop_the_others(
     assert opened.scenes == Map.open(tmp_path / "map").scenes == ("alpha", "beta")
     assert len(list((tmp_path / "once").iterdir())) == 1
     assert len(list((tmp_path / "always").iterdir())) == 3
+
+
+def test_a_results_file_is_used_if_it_is_that_of_the_recording(
+    small: Rooms, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    contents = small_map(tmp_path / "map")._store.contents.empty()
+    task = LearnTask(contents, None, QUICK, results=str(tmp_path))
+    first, second = (task.result_of(room) for room in small[:2])
+    assert first is not None
+    assert second is not None
+    expected = task.learn(0, small[0])
+    task.learn(1, small[1])
+    right = Path(first).read_bytes()
+    unpack_map(Path(first), tmp_path / "one")
+    empty = MapStore.open(tmp_path / "one")
+    remove_scenes(empty, ["alpha"])
+    pack_map(tmp_path / "one", tmp_path / "empty.zip")
+    smaller = replace(task, memory=4)
+    renamed = smaller.result_of(small[0])
+    assert renamed is not None
+    damaged = {
+        "it holds beta": Path(second).read_bytes(),
+        "it holds no scene": (tmp_path / "empty.zip").read_bytes(),
+        "not a zip archive": right[: len(right) // 2],
+        "bytes|zip": right[:-9] + bytes(9),
+    }
+    for message, content in damaged.items():
+        caplog.clear()
+        Path(first).write_bytes(content)
+        learned = task.learn(0, small[0])
+        assert learned.scene is not None
+        assert learned.scene.name == "alpha"
+        assert re.search(
+            f"{Path(first).name} is not the result of.*{message}", caplog.text
+        )
+        caplog.clear()
+        assert task.learn(0, small[0]).scene is not None
+        assert not caplog.text
+    Path(first).write_bytes(right)
+    Path(renamed).write_bytes(right)
+    caplog.clear()
+    other = smaller.learn(0, small[0])
+    assert other.report is not None
+    assert f"it was written as '{Path(first).name}'" in caplog.text
+    caplog.clear()
+    kept = task.learn(0, small[0])
+    assert not caplog.text
+    assert kept.report is not None
+    assert expected.report is not None
+    assert kept.report.stored() == json.loads(json.dumps(expected.report.stored()))
 
 
 def test_names_are_checked_before_anything_is_learned(

@@ -46,7 +46,7 @@ def scenes(rooms: tuple[Recording, ...]) -> list[SceneMap]:
         camera = room.train[0].camera
         marks = [
             Landmarks(
-                pixels=rng.integers(0, 640, (n, 2)).astype(float),
+                pixels=rng.integers(0, (64, 48), (n, 2)).astype(float),
                 inverse_depth=rng.uniform(0.1, 4, n).astype(np.float32).astype(float),
                 slope=rng.normal(0, 0.01, (n, 2)).astype(np.float32).astype(float),
                 sigma=rng.uniform(0.001, 0.1, n).astype(np.float32).astype(float),
@@ -57,7 +57,7 @@ def scenes(rooms: tuple[Recording, ...]) -> list[SceneMap]:
             store_keyframes(room.train[:2], 48),
             inverse_depth=tuple(np.full(48, 0.5 + i, np.float16) for _ in marks),
             landmarks=tuple(marks),
-            descriptors=rng.normal(size=(2, 16)).astype(np.float16),
+            descriptors=rng.normal(size=(2, 128)).astype(np.float16),
         )
         poses = SE3.exp(rng.normal(size=(5, 6)))
         motion = SE3.exp(rng.normal(size=6))

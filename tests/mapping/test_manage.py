@@ -337,8 +337,10 @@ def test_changes_that_a_full_disk_refuses_leave_nothing(
             with full_disk(step + 1):
                 CHANGES[name](folder, scenes[0])
             break
-        except OSError:
+        except OSError as error:
+            named = error.filename
             refused += 1
+            assert named
             assert everything(folder) == state, (step, kinds[step])
     assert refused >= 3
     assert everything(folder) != state

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from evercal.bounds import VARIABLE
 from evercal.errors import InputError
 from evercal.mapping import manage
 from evercal.mapping.manage import pack_map, remove_scenes, unpack_map
-from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.store import MapStore
-from evercal.storage.archive import ArchiveLimits
 from evercal.storage.manifest import MANIFEST, Manifest, write_manifest
 
 Tree = Callable[[Path], dict[str, str]]
@@ -70,7 +69,7 @@ def rezipped(
 
 
 def test_archives_that_are_no_complete_map_are_refused(
-    root: Path, scenes: list[SceneMap], tmp_path: Path, tree: Tree
+    root: Path, tmp_path: Path, tree: Tree, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     packed = tmp_path / "map.zip"
     pack_map(root, packed)
@@ -113,8 +112,9 @@ def test_archives_that_are_no_complete_map_are_refused(
         assert "\n" not in str(refused.value)
         assert "unpacking" not in str(refused.value)
         broken.unlink()
-    with pytest.raises(InputError, match="when extracted; at most"):
-        unpack_map(packed, tmp_path / "copy", ArchiveLimits(bytes=10_000))
+    monkeypatch.setenv(VARIABLE, "archive_bytes=10_000")
+    with pytest.raises(InputError, match="bytes when extracted, at most 10,000"):
+        unpack_map(packed, tmp_path / "copy")
     left = tree(tmp_path)
     left.pop(".copy.lock")
     assert left == before

@@ -89,8 +89,9 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(OSError, match="No space") as error:
         write_bytes(file, b"new")
+    assert error.value.filename == str(file)
     assert file.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["a"]
 

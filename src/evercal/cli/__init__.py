@@ -13,6 +13,7 @@ import os
 import platform
 import shutil
 import sys
+import tempfile
 import textwrap
 from collections.abc import Sequence
 from typing import Any
@@ -82,12 +83,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         _discard_stdout()  # the reader closed the pipe
         return 0
     except OSError as error:  # a full disk, a folder that may not be written
-        where = f"{error.filename}: " if error.filename else ""
+        # What writes elsewhere names its file.
+        where = error.filename or f"standard output or {tempfile.gettempdir()}"
         try:
             sys.stdout.flush()
         except OSError:
             _discard_stdout()
-        return _complain(f"{where}{error.strerror or error}", as_json)
+        return _complain(f"{where}: {error.strerror or error}", as_json)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from evercal.errors import InputError
 from evercal.features.views import working_grey
 from evercal.features.vlad import Vlad, fit_centroids, unit
-from evercal.storage.atomic import write_bytes
+from evercal.storage.atomic import naming_file, write_bytes
 from evercal.storage.tensors import load_tensors, save_tensors
 from evercal.typing import Array, Float32Array, Image
 
@@ -177,7 +177,8 @@ class _OnnxNetwork:
         # OpenCV's classic engine takes half the time, and is only used for a file.
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "encoder.onnx"
-            file.write_bytes(self.data)
+            with naming_file(file):
+                file.write_bytes(self.data)
             level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
             try:
                 for engine in (cv2.dnn.ENGINE_CLASSIC, cv2.dnn.ENGINE_AUTO):

@@ -1,6 +1,7 @@
 """One of many recordings: what is learned, by whichever process, and where the result is kept."""
 
 import hashlib
+import logging
 import pickle
 import tempfile
 from collections.abc import Callable
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evercal.errors import InputError
+from evercal.errors import InputError, printable
 from evercal.learning.report import LearnReport
 from evercal.learning.scene import learn_scene
 from evercal.mapping.build import MapOptions
@@ -21,6 +22,9 @@ from evercal.recordings import addresses, load_recording
 from evercal.recordings.addresses import RecordingAt
 from evercal.recordings.frame import Recording
 from evercal.recordings.held_out import named_recording
+
+_RESULT = "result"
+"""Entry of a stored report: name of the file of results, which has the recording's digest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +64,13 @@ class LearnTask:
         """Learn one recording; an unusable one becomes an outcome."""
         try:
             file = self.result_of(source)
+            learned = None
             if file is not None and addresses.exists(file):
-                return Learned(number, *_kept(file))
-            learned = self._learn(source)
-            if file is not None:
-                _keep(file, self.contents, *learned)
+                learned = _kept(file, source.name)
+            if learned is None:
+                learned = self._learn(source)
+                if file is not None:
+                    _keep(file, self.contents, *learned)
         except InputError as error:
             return Learned(number, error=str(error))
         return Learned(number, *learned)
@@ -94,16 +100,48 @@ def _keep(
     with tempfile.TemporaryDirectory(prefix="evercal-") as folder:
         root = Path(folder, "map")
         packed = Path(folder, "map.zip")
-        MapStore(root, contents.empty()).commit(scene, report.stored())
+        stored = {**report.stored(), _RESULT: _result_name(file)}
+        MapStore(root, contents.empty()).commit(scene, stored)
         pack_map(root, packed)
         addresses.put(packed, file)
 
 
-def _kept(file: str) -> tuple[SceneMap, LearnReport]:
+def _kept(file: str, name: str) -> tuple[SceneMap, LearnReport] | None:
+    """The result in a file; None, with a warning, if it is not that of this recording."""
     with addresses.local_copy(file) as packed, tempfile.TemporaryDirectory() as folder:
-        unpack_map(packed, Path(folder, "map"))
-        store = MapStore.open(Path(folder, "map"))
-        scene = store.contents.scenes[0]
-        report = LearnReport.from_stored(store.reports()[0])
-        every = np.arange(len(scene.keyframes))  # taken out of the file, which goes
-        return replace(scene, keyframes=scene.keyframes.take(every)), report
+        try:
+            return _unpacked(packed, Path(folder, "map"), name, _result_name(file))
+        except InputError as error:
+            result = _result_name(file)
+            logging.getLogger(__name__).warning(
+                "%s is not the result of %s (%s); the recording is learned again",
+                printable(result),
+                printable(name),
+                str(error).replace(str(packed), result),
+            )
+            return None
+
+
+def _unpacked(
+    packed: Path, root: Path, name: str, result: str
+) -> tuple[SceneMap, LearnReport]:
+    unpack_map(packed, root)
+    store = MapStore.open(root)
+    scenes = store.contents.scenes
+    if [scene.name for scene in scenes] != [name]:
+        names = ", ".join(scene.name for scene in scenes)
+        raise InputError(f"it holds {names or 'no scene'}")
+    stored = store.reports()[0]
+    if stored.get(_RESULT) != result:
+        raise InputError(f"it was written as {stored.get(_RESULT)!r}")
+    (scene,) = scenes
+    every = np.arange(len(scene.keyframes))  # taken out of the file, which goes
+    scene = replace(scene, keyframes=scene.keyframes.take(every))
+    try:
+        return scene, LearnReport.from_stored(stored)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"its report is broken: {error!r}") from None
+
+
+def _result_name(file: str) -> str:
+    return file.rpartition("/")[2]

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.errors import InputError
 from evercal.features.views import working_image
 from evercal.geometry import SE3, Camera
 from evercal.mapping.landmarks import Landmarks
@@ -92,7 +93,8 @@ class Keyframes:
         grey = cv2.imdecode(
             np.frombuffer(self.images[i], np.uint8), cv2.IMREAD_GRAYSCALE
         )
-        assert grey is not None, "stored images have checksums"
+        if grey is None:
+            raise InputError(f"keyframe {i} is no image; restore the map from a copy")
         return np.asarray(grey, np.uint8)
 
     def frames(self) -> list[Frame]:

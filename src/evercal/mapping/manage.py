@@ -5,7 +5,6 @@ last complete state.
 """
 
 import hashlib
-import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -13,21 +12,23 @@ from functools import partial
 from pathlib import Path
 from typing import get_args
 
+from evercal.bounds import bounds
 from evercal.choices import OnClash
 from evercal.errors import InputError
 from evercal.features.encoder import read_network
 from evercal.mapping.scene_map import MapContents, SceneMap
-from evercal.mapping.store import PREVIOUS, SCENE, MapStore, read_scene, require_map
+from evercal.mapping.store import PREVIOUS, SCENE, MapStore, read_scenes, require_map
 from evercal.recordings.frame import checked_name
 from evercal.storage.archive import (
-    ArchiveLimits,
     check_archive,
     extract_archive,
+    read_entry,
     write_archive,
 )
 from evercal.storage.atomic import replace_folder, write_bytes, write_json
 from evercal.storage.manifest import MANIFEST, Manifest
 from evercal.storage.stages import REPORT, STAGES, StageStore, is_store, read_store
+from evercal.storage.text_files import read_json
 from evercal.typing import PathLike
 
 
@@ -200,34 +201,32 @@ def pack_map(root: Path, file: Path) -> None:
     read_store(root, write)
 
 
-def unpack_map(
-    file: Path,
-    folder: Path,
-    limits: ArchiveLimits | None = None,
-) -> None:
+def unpack_map(file: Path, folder: Path) -> None:
     """Extract a map that `pack_map` has written: whole, or not at all.
 
-    The archive is not trusted: paths, links, sizes, checksums and schema are checked, and every
-    scene is read, before the folder appears.
+    The archive is not trusted. Its manifest is read first, and must list its files with their
+    sizes. Then paths, links, checksums and schema are checked, and every scene is read, before the
+    folder appears.
     """
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError(f"{folder}: exists; give a new folder")
     if not file.is_file():
         raise InputError(f"{file}: no such file; give an archive of 'evercal map pack'")
-    limits = limits or ArchiveLimits()
-    names = check_archive(file, limits)
-    if MANIFEST not in names:
+    sizes = check_archive(file)
+    if sizes.pop(MANIFEST, None) is None:
         raise InputError(
             f"{file}: no {MANIFEST} in it; give an archive of 'evercal map pack'"
         )
+    content = read_entry(file, MANIFEST, bounds().manifest_bytes)
+    _require_listed(sizes, Manifest.of(content, file), file)
     resolved = folder.resolve()
     temporary = resolved.with_name(f".{resolved.name}.unpacking")
     with StageStore(folder, None).writing():
         # Left by a process that was killed.
         shutil.rmtree(temporary, ignore_errors=True)
         try:
-            extract_archive(file, temporary, limits)
-            _require_map_of(temporary, names, file)
+            extract_archive(file, temporary)
+            _require_map_of(temporary, file)
             replace_folder(temporary, resolved)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -249,7 +248,7 @@ def _write_name(folder: Path, name: str) -> None:
     previous = f"{PREVIOUS}{SCENE}"
     for file, key in ((SCENE, "name"), (REPORT, "scene"), (previous, "name")):
         if file != previous or (folder / file).exists():
-            content = json.loads((folder / file).read_text(encoding="utf-8"))
+            content = read_json(folder / file, "part of a scene", "restore the map")
             write_json(folder / file, {**content, key: name})
 
 
@@ -263,8 +262,9 @@ def _free_name(name: str, taken: set[str]) -> str:
 def _incoming(root: Path) -> tuple[Manifest, list[_Incoming]]:
     def read(manifest: Manifest) -> tuple[Manifest, list[_Incoming]]:
         scenes = []
-        for stage in map(str, require_map(root, manifest)["stages"]):
-            scene = read_scene(root / STAGES / stage)
+        for scene, stage in zip(
+            read_scenes(root, manifest), manifest.payload["stages"], strict=True
+        ):
             scenes.append(_Incoming(root, stage, manifest, scene))
         return manifest, scenes
 
@@ -356,21 +356,24 @@ def _copy(
     write_bytes(target, data)
 
 
-def _require_map_of(
-    root: Path,
-    names: Sequence[str],
-    file: Path,
-) -> None:
+def _require_listed(sizes: dict[str, int], manifest: Manifest, file: Path) -> None:
+    """Refuse an archive whose files are not those of its manifest."""
+    listed = {name: record["bytes"] for name, record in manifest.files.items()}
+    for name in sorted(sizes.keys() | listed.keys()):
+        if name not in listed:
+            raise InputError(f"{file}: {name} is not in its manifest")
+        if name not in sizes:
+            raise InputError(f"{file}: {name} is missing")
+        if sizes[name] != listed[name]:
+            raise InputError(
+                f"{file}: {name} has {sizes[name]} bytes, expected {listed[name]}"
+            )
+
+
+def _require_map_of(root: Path, file: Path) -> None:
     try:
-        listed = {MANIFEST, *Manifest.read(root).files}
-        if extra := sorted(set(names) - listed):
-            raise InputError(f"{root}: {extra[0]} is not in its manifest")
         _incoming(root)
     except InputError as error:
         raise InputError(
             f"{file}: {str(error).replace(str(root), file.name)}"
-        ) from None
-    except Exception as error:  # files with right checksums, written by another program
-        raise InputError(
-            f"{file}: is not a map that evercal wrote ({error!r})"
         ) from None

@@ -9,16 +9,19 @@ stages/0001-NAME/
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.bounds import TooLargeError, bounds
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder, Features, load_encoder
 from evercal.geometry import SE3, Camera, pose_to_dict
+from evercal.mapping.consistency import require_consistent, require_of_encoder
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity
 from evercal.mapping.scene_map import MapContents, SceneMap
@@ -30,6 +33,7 @@ from evercal.storage.stages import (
     STAGES,
     StageStore,
     is_store,
+    read_report,
     read_store,
     require_free,
     write_report,
@@ -48,6 +52,8 @@ _STATE = (SCENE, KEYFRAMES, CORRECTION)
 """Files that a refresh replaces."""
 PREVIOUS = "previous-"
 """Prefix of their state before the last refresh."""
+_FILES = (*_STATE, REPORT, REFRESHES, *(PREVIOUS + name for name in _STATE))
+"""Files of a scene."""
 
 
 class MapStore(StageStore[MapContents]):
@@ -74,7 +80,10 @@ class MapStore(StageStore[MapContents]):
             contents = MapContents(local, int(payload["short_side"]))
             stages = [str(name) for name in payload["stages"]]
             store = cls(root, contents, stages, (first, *centroids))
-            contents.scenes = [read_scene(store.folder(name)) for name in stages]
+            contents.scenes = read_scenes(root, manifest)
+            for name, scene in zip(stages, contents.scenes, strict=True):
+                with _of_evercal(store.folder(name)):
+                    require_of_encoder(scene, local, contents.short_side)
             return store
 
         return read_store(root, read)
@@ -106,6 +115,10 @@ class MapStore(StageStore[MapContents]):
 
     def commit(self, scene: SceneMap, report: Mapping[str, object]) -> None:
         """Add a scene: whole, or not at all."""
+        if scene.name in self.contents.names:
+            raise InputError(
+                f"scene {scene.name!r}: map {self.root} has a scene of this name"
+            )
 
         def write(folder: Path) -> None:
             if not self.networks:
@@ -192,10 +205,12 @@ def stored_scenes(root: Path) -> list[tuple[str, Camera, dict[str, Any]]]:
         scenes = []
         for name in require_map(root, manifest)["stages"]:
             folder = root / STAGES / str(name)
-            scene = json.loads((folder / SCENE).read_text())
-            report = json.loads((folder / REPORT).read_text())
-            camera = Camera.from_dict(scene["adjusted_camera"])
-            scenes.append((checked_name(scene["name"]), camera, report))
+            with _of_evercal(folder):
+                scene = json.loads((folder / SCENE).read_text())
+                camera = Camera.from_dict(scene["adjusted_camera"])
+                name = checked_name(scene["name"])
+            scenes.append((name, camera, read_report(folder)))
+        _require_unique(root, [name for name, _, _ in scenes])
         return scenes
 
     return read_store(root, read)
@@ -208,11 +223,30 @@ def require_map(root: Path, manifest: Manifest) -> dict[str, Any]:
         raise InputError(
             f"store {root}: holds networks of strategy {payload.get('strategy')!r}, not a map"
         )
-    if not isinstance(payload.get("short_side"), int):
+    short_side = payload.get("short_side")
+    if not isinstance(short_side, int) or not 16 <= short_side <= bounds().map_side:
         raise InputError(
-            f"store {root}: 'short_side' in the manifest is not a number; restore it"
+            f"store {root}: 'short_side' in the manifest is {short_side!r}; restore it"
+        )
+    if not payload["networks"]:
+        raise InputError(f"store {root}: the manifest lists no encoder; restore it")
+    known = set(payload["networks"])
+    for stage in payload["stages"]:
+        known.update(f"{STAGES}/{stage}/{name}" for name in _FILES)
+    if others := sorted(manifest.files.keys() - known):
+        raise InputError(
+            f"store {root}: {others[0]} in the manifest is no file of a map; restore it"
         )
     return payload
+
+
+def _require_unique(root: Path, names: Sequence[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(
+                f"store {root}: two scenes are named {name!r}; learn its scenes again into a new"
+                " map, or restore it from a copy"
+            )
 
 
 def write_scene(folder: Path, scene: SceneMap) -> None:
@@ -247,10 +281,28 @@ def _move(source: Path, target: Path) -> None:
         source.rename(target)
 
 
+def read_scenes(root: Path, manifest: Manifest) -> list[SceneMap]:
+    """The scenes that a manifest lists; two of one name are refused."""
+    stages = require_map(root, manifest)["stages"]
+    scenes = [read_scene(root / STAGES / str(name)) for name in stages]
+    _require_unique(root, [scene.name for scene in scenes])
+    return scenes
+
+
 def read_scene(folder: Path) -> SceneMap:
-    """Read a scene from its folder."""
+    """Read a scene from its folder, and check that its parts agree."""
+    with _of_evercal(folder):
+        scene = _read_scene(folder)
+        require_consistent(scene)
+        return scene
+
+
+@contextmanager
+def _of_evercal(folder: Path) -> Iterator[None]:
     try:
-        return _read_scene(folder)
+        yield
+    except TooLargeError as error:
+        raise InputError(f"{folder}: {error}") from None
     except (InputError, OSError):
         raise
     except Exception as error:

@@ -14,9 +14,9 @@ import imagesize
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evercal.bounds import require_image_size
+from evercal.bounds import bounds, require_image_size
 from evercal.errors import InputError
-from evercal.storage.atomic import write_bytes
+from evercal.storage.atomic import naming_file, write_bytes
 from evercal.storage.text_files import named_errors, natural_key
 from evercal.typing import Image, PathLike
 
@@ -28,8 +28,6 @@ _JPEG = b"\xff\xd8"
 """Beginning of a JPEG file."""
 _SCAN = b"\xff\xda"
 """Beginning of a scan in a JPEG file."""
-_MOST_SCANS = 100
-"""Maximum number of scans; progressive files have about ten."""
 _TURNED = re.compile(rb"(\x01\x12\0\x03\0{3}\x01\0|\x12\x01\x03\0\x01\0{3})[\x02-\x08]")
 """EXIF orientation other than upright."""
 _TIFF = {b"II*\0": "<u4", b"MM\0*": ">u4"}
@@ -225,7 +223,7 @@ def decode_image(data: Image, turned: bool = True, name: str = "image") -> Image
     # IMREAD_UNCHANGED would ignore the orientation; ANYDEPTH keeps 16 bits for as_rgb to round.
     # IMREAD_COLOR_RGB leaves the pixels of a TIFF of 16 bits as they were in memory.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-    if data[:2].tobytes() == _JPEG and data.tobytes().count(_SCAN) > _MOST_SCANS:
+    if data[:2].tobytes() == _JPEG and data.tobytes().count(_SCAN) > bounds().scans:
         return None  # each scan takes as long as a whole image
     if not turned:
         flags |= cv2.IMREAD_IGNORE_ORIENTATION
@@ -284,7 +282,8 @@ def write_image(path: PathLike, image: Image) -> None:
         raise InputError(
             f"{path}: '{path.suffix}' is no image format; use .png or .jpg"
         ) from None
-    path.write_bytes(data.tobytes())
+    with naming_file(path):
+        path.write_bytes(data.tobytes())
 
 
 def write_jpeg(path: PathLike, image: Image, quality: int) -> None:

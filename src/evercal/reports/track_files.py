@@ -8,6 +8,7 @@ from evercal.errors import InputError
 from evercal.geometry import pose_to_dict
 from evercal.localization.tracking import TrackedFrame
 from evercal.reports.answers import Answer, answer_row
+from evercal.storage.atomic import naming_file
 
 ENDINGS = (".jsonl", ".tum", ".txt")
 """Endings of the names of files of poses."""
@@ -45,6 +46,7 @@ class TrackFile(AbstractContextManager["TrackFile"]):
                 f"{path}: give a file name that ends with {', '.join(ENDINGS)}"
             )
         self._tum = path.suffix.lower() != ".jsonl"
+        self._path = path
         self._file = path.open("w", encoding="utf-8")
         if self._tum:
             self._file.write(_TUM_HEADER)
@@ -54,8 +56,9 @@ class TrackFile(AbstractContextManager["TrackFile"]):
         line = json.dumps(row) + "\n"
         if self._tum:
             line = _tum_line(frame)
-        self._file.write(line)
-        self._file.flush()
+        with naming_file(self._path):
+            self._file.write(line)
+            self._file.flush()
 
     def __exit__(self, *_: object) -> None:
         self._file.close()

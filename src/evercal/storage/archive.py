@@ -7,11 +7,11 @@ import stat
 import zipfile
 import zlib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from evercal.bounds import require_at_most
 from evercal.errors import InputError
-from evercal.storage.atomic import replacing
+from evercal.storage.atomic import naming_file, replacing
 from evercal.typing import PathLike
 
 _DIRECTORY_BYTES = 512
@@ -29,16 +29,6 @@ _BROKEN = (
     NotImplementedError,
 )
 """Errors of the library while it reads a damaged archive."""
-
-
-@dataclass(frozen=True)
-class ArchiveLimits:
-    """What an archive may contain."""
-
-    bytes: int = 20 * 10**9
-    """Size of all extracted files."""
-    files: int = 200_000
-    """Number of entries."""
 
 
 def write_archive(file: PathLike, root: Path, names: Iterable[str]) -> None:
@@ -66,26 +56,34 @@ def write_archive(file: PathLike, root: Path, names: Iterable[str]) -> None:
                 shutil.copyfileobj(source, target, _CHUNK)
 
 
-def check_archive(file: Path, limits: ArchiveLimits = ArchiveLimits()) -> list[str]:
+def check_archive(file: Path) -> dict[str, int]:
     """Check the entries of a zip archive without extracting them.
 
     Returns:
-        The paths of its files.
+        Path and size of every file, bytes.
     """
-    with _opened(file, limits) as archive:
-        return [e.filename for e in _checked(archive, file, limits) if not e.is_dir()]
+    with _opened(file) as archive:
+        entries = _checked(archive, file)
+        return {e.filename: e.file_size for e in entries if not e.is_dir()}
 
 
-def extract_archive(
-    file: Path, folder: Path, limits: ArchiveLimits = ArchiveLimits()
-) -> None:
+def read_entry(file: Path, name: str, most: int) -> bytes:
+    """Read one file of a zip archive, of at most so many bytes."""
+    with _opened(file) as archive:
+        size = archive.getinfo(name).file_size
+        if size > most:
+            raise InputError(f"{file}: {name} has {size:,} bytes, at most {most:,}")
+        return archive.read(name)
+
+
+def extract_archive(file: Path, folder: Path) -> None:
     """Extract a zip archive into a folder that does not exist yet.
 
     Sizes are checked twice: as the archive states them, and while the files are written.
     """
     folder.mkdir(parents=True)
-    with _opened(file, limits) as archive:
-        for entry in _checked(archive, file, limits):
+    with _opened(file) as archive:
+        for entry in _checked(archive, file):
             path = folder / entry.filename
             if entry.is_dir():
                 path.mkdir(parents=True, exist_ok=True)
@@ -95,9 +93,9 @@ def extract_archive(
 
 
 @contextlib.contextmanager
-def _opened(file: Path, limits: ArchiveLimits) -> Iterator[zipfile.ZipFile]:
+def _opened(file: Path) -> Iterator[zipfile.ZipFile]:
     try:
-        with zipfile.ZipFile(_bounded(file, limits)) as archive:
+        with zipfile.ZipFile(_bounded(file)) as archive:
             yield archive
     except (*_BROKEN, OSError) as error:
         # A broken offset is an invalid argument of a system call.
@@ -106,21 +104,26 @@ def _opened(file: Path, limits: ArchiveLimits) -> Iterator[zipfile.ZipFile]:
         raise InputError(f"{file}: not a readable zip archive ({error})") from None
 
 
-def _bounded(file: Path, limits: ArchiveLimits) -> Path:
+def _bounded(file: Path) -> Path:
     with open(file, "rb") as opened:
         # The library's own search, so that both find the same directory.
         end = zipfile._EndRecData(opened)  # pyright: ignore[reportAttributeAccessIssue]
     if not end:
         raise InputError(f"{file}: not a zip archive")
     entries, directory_bytes = end[4:6]
-    if max(entries, directory_bytes // _DIRECTORY_BYTES) > limits.files:
-        raise InputError(f"{file}: more than {limits.files:,} entries; split it")
+    count = max(entries, directory_bytes // _DIRECTORY_BYTES)
+    _require_at_most(file, count, "archive_files", "entries")
     return file
 
 
-def _checked(
-    archive: zipfile.ZipFile, file: Path, limits: ArchiveLimits
-) -> list[zipfile.ZipInfo]:
+def _require_at_most(file: Path, count: int, name: str, what: str) -> None:
+    try:
+        require_at_most(count, name, what)
+    except ValueError as error:
+        raise InputError(f"{file}: {error}") from None
+
+
+def _checked(archive: zipfile.ZipFile, file: Path) -> list[zipfile.ZipInfo]:
     """The entries, if all of them may be extracted."""
     entries = archive.infolist()
     total = 0
@@ -157,10 +160,9 @@ def _checked(
         raise InputError(
             f"{file}: entry {min(files & folders)!r} is a file and a folder"
         )
-    if total > limits.bytes:
-        raise InputError(
-            f"{file}: {total / 1e9:.1f} GB when extracted; at most {limits.bytes / 1e9:.1f} GB"
-        )
+    _require_at_most(file, total, "archive_bytes", "bytes when extracted")
+    ratio = total // max(1, file.stat().st_size)
+    _require_at_most(file, ratio, "archive_ratio", "times its own size when extracted")
     return entries
 
 
@@ -174,7 +176,7 @@ def _stays_inside(name: str) -> bool:
 
 def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) -> None:
     left = entry.file_size
-    with archive.open(entry) as source, open(path, "xb") as target:
+    with naming_file(path), archive.open(entry) as source, open(path, "xb") as target:
         while data := source.read(_CHUNK):
             left -= len(data)
             if left < 0:

@@ -27,6 +27,16 @@ def write_bytes(path: PathLike, data: bytes) -> None:
 
 
 @contextlib.contextmanager
+def naming_file(path: PathLike) -> Iterator[None]:
+    """Name a file in an error that names none: calls that notice a full disk know no path."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
+
+
+@contextlib.contextmanager
 def replacing(path: PathLike) -> Iterator[BinaryIO]:
     """Open a file that takes the place of `path` when the block ends without an error.
 
@@ -36,7 +46,7 @@ def replacing(path: PathLike) -> Iterator[BinaryIO]:
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
-        with open(temporary, "xb") as file:
+        with naming_file(path), open(temporary, "xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -103,7 +113,7 @@ def _aside(final: Path) -> Path:
 
 
 def _sync(file: Path) -> None:
-    with open(file, "rb") as handle:
+    with naming_file(file), open(file, "rb") as handle:
         os.fsync(handle.fileno())
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Self
 
+from evercal.bounds import require_at_most
 from evercal.errors import InputError
 from evercal.storage.atomic import write_json
 from evercal.typing import PathLike
@@ -45,7 +46,24 @@ class Manifest:
     @classmethod
     def read(cls, root: PathLike) -> Self:
         """Read a manifest; files are not checked, see `problems`."""
-        whole = _read(Path(root))
+        root = Path(root)
+        file = root / MANIFEST
+        if not root.is_dir():
+            raise InputError(f"{root}: no such folder")
+        try:
+            require_at_most(file.stat().st_size, "manifest_bytes", "bytes")
+            return cls.of(file.read_bytes(), file)
+        except OSError:
+            raise InputError(
+                f"{root}: no {MANIFEST} in it, so it is not a store"
+            ) from None
+        except ValueError as error:
+            raise InputError(f"{file}: {error}") from None
+
+    @classmethod
+    def of(cls, content: bytes, file: Path) -> Self:
+        """The manifest that a file holds, after a check of its shape and its own checksum."""
+        whole = _checked(content, file)
         return cls(whole["payload"], whole["files"])
 
     def problems(self, root: PathLike) -> list[str]:
@@ -122,15 +140,9 @@ def verify(root: PathLike) -> list[str]:
             return problems
 
 
-def _read(root: Path) -> dict[str, dict]:
-    """The whole manifest after a check of its shape and its own checksum."""
-    file = root / MANIFEST
-    if not root.is_dir():
-        raise InputError(f"{root}: no such folder")
+def _checked(content: bytes, file: Path) -> dict[str, dict]:
     try:
-        data = json.loads(file.read_bytes())
-    except OSError:
-        raise InputError(f"{root}: no {MANIFEST} in it, so it is not a store") from None
+        data = json.loads(content)
     except (ValueError, RecursionError):
         raise InputError(
             f"{file}: broken, not valid JSON; restore it from a copy"
@@ -155,9 +167,10 @@ def _read(root: Path) -> dict[str, dict]:
             raise InputError(
                 f"{file}: broken, entry {relative!r} is no file of this folder"
             )
-        if not {"sha256", "bytes"} <= record.keys():
+        kinds = {key: type(value) for key, value in record.items()}
+        if kinds != {"sha256": str, "bytes": int}:
             raise InputError(
-                f"{file}: broken, entry {relative!r} lacks sha256 or bytes"
+                f"{file}: broken, entry {relative!r} is not its sha256 and bytes"
             )
     return data
 

@@ -27,6 +27,7 @@ from filelock import FileLock, Timeout
 from evercal.errors import InputError
 from evercal.storage.atomic import replace_folder, write_json
 from evercal.storage.manifest import MANIFEST, Manifest, write_manifest
+from evercal.storage.text_files import read_json
 
 SCHEMA = 6
 """Version of the files of a store."""
@@ -134,7 +135,7 @@ def _check(root: Path, manifest: Manifest) -> None:
 
 
 def _listed(root: Path, manifest: Manifest, key: str) -> list[object]:
-    names = manifest.payload.get(key, [])
+    names = manifest.payload.get(key)
     if not isinstance(names, list):
         raise InputError(
             f"store {root}: {key!r} in the manifest is not a list; restore it"
@@ -266,9 +267,7 @@ class StageStore(Generic[Contents]):
 
     def reports(self) -> list[dict[str, Any]]:
         """`report.json` of every stage, in order."""
-        return [
-            json.loads((self.folder(name) / REPORT).read_text()) for name in self.stages
-        ]
+        return [read_report(self.folder(name)) for name in self.stages]
 
     def size_bytes(self) -> dict[str, int]:
         """Size on disk of every file in the manifest, by relative path."""
@@ -378,6 +377,11 @@ def _names(folder: Path) -> set[str]:
 
 def _made(manifest: Manifest) -> int:
     return int(manifest.payload.get(_MADE, len(manifest.payload["stages"])))
+
+
+def read_report(folder: Path) -> dict[str, Any]:
+    """Read `report.json` of a stage."""
+    return read_json(folder / REPORT, "report of a scene", "restore the map")
 
 
 def write_report(folder: Path, report: Payload) -> None:

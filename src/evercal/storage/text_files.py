@@ -8,11 +8,9 @@ from difflib import get_close_matches
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
-from evercal.bounds import require_at_most
+from evercal.bounds import bounds, require_at_most
 from evercal.errors import InputError
 
-_DEPTH = 50
-"""Nested lists and objects in YAML."""
 _CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f-\x9f]")
 _OF_OPENCV = re.compile(r"^%.*$|!!opencv-[a-z-]+", re.MULTILINE)
 """Not valid YAML. cv2.FileStorage can end the process on such files."""
@@ -142,7 +140,7 @@ def yaml_documents(text: str) -> list[Any]:
             nodes += isinstance(event, yaml.NodeEvent)
             word = getattr(event, "value", "")
             is_reference = isinstance(event, yaml.AliasEvent) or word == "<<"
-            if is_reference or getattr(event, "tag", None) or depth > _DEPTH:
+            if is_reference or getattr(event, "tag", None) or depth > bounds().depth:
                 raise ValueError(
                     "it holds references (*name), tags (!name) or nests too deeply"
                 )
