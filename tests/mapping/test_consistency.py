@@ -75,13 +75,13 @@ ARRAYS: dict[str, Callable[[Arrays], object]] = {
     "parts of .1, 2. keyframes": lambda a: a.update(descriptors=a["descriptors"][:1]),
     "descriptors: numbers are finite": lambda a: a["descriptors"].fill(np.nan),
     "parts of .1, 2. keyframe": lambda a: a.update(poses=a["poses"][:1]),
-    "47 depths of 48 cells": lambda a: a.update(
+    "47 depths of 6x8 cells": lambda a: a.update(
         cells=np.array([47, 49]),
     ),
     "a scene has landmarks": without_landmarks,
-    "landmarks out of range": lambda a: a["landmark_pixels"].fill(64),
-    "landmarks out of ran": lambda a: a["landmark_sigma"].fill(0),
-    "landmarks out of": lambda a: a["landmark_inverse_depth"].fill(-1),
+    "landmarks outside": lambda a: a["landmark_pixels"].fill(64),
+    "landmarks without": lambda a: a["landmark_sigma"].fill(0),
+    "landmarks without depth": lambda a: a["landmark_inverse_depth"].fill(-1),
 }
 SCENES: dict[str, Callable[[dict[str, Any]], object]] = {
     "camera .1000000000x48": lambda s: s["camera"].update(width=10**9),
@@ -156,7 +156,7 @@ def test_a_name_twice_is_refused(
     second.write_text(json.dumps({**content, "name": "alpha"}))
     rewritten(tmp_path / "map", {})
     for read in (MapStore.open, stored_scenes):
-        with pytest.raises(InputError, match="two scenes are named 'alpha'"):
+        with pytest.raises(InputError, match="'alpha' comes twice"):
             read(tmp_path / "map")
 
 

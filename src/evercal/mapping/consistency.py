@@ -18,15 +18,21 @@ def require_consistent(scene: SceneMap) -> None:
     for camera in (scene.camera, scene.adjusted_camera):
         require_image_size(camera.width, camera.height, "camera")
     keyframes = scene.keyframes
-    _require_finite("unit", scene.unit or 1.0, scene.intrinsics_sigma)
     descriptors = keyframes.descriptors
     assert descriptors is not None, "a map has descriptors"
+    _require_finite("unit", scene.unit or 1.0, scene.intrinsics_sigma)
     _require_finite("descriptors", descriptors)
     _require_frame(scene.frame)
-    _require(scene.train_frames >= 0 and scene.landmarks > 0, "a scene has landmarks")
-    counts = {len(keyframes.cameras), len(descriptors)}
-    for name in ("images", "base_from_camera", "inverse_depth", "landmarks"):
-        counts.add(len(getattr(keyframes, name)))
+    _require(scene.train_frames > 0, "a scene has training frames")
+    _require(scene.landmarks > 0, "a scene has landmarks")
+    counts = {
+        len(keyframes.images),
+        len(keyframes.cameras),
+        len(keyframes.base_from_camera),
+        len(keyframes.inverse_depth),
+        len(keyframes.landmarks),
+        len(descriptors),
+    }
     _require(len(counts) == 1, f"parts of {counts} keyframes")
     for i in range(len(keyframes)):
         _require_keyframe(keyframes, i)
@@ -35,29 +41,43 @@ def require_consistent(scene: SceneMap) -> None:
 def require_of_encoder(scene: SceneMap, encoder: Encoder, short_side: int) -> None:
     """Raise ValueError for a scene that another encoder has made."""
     keyframes = scene.keyframes
-    if encoder.centroids is not None and keyframes.descriptors is not None:
+    descriptors = keyframes.descriptors
+    if encoder.centroids is not None and descriptors is not None:
         width = min(encoder.centroids.size, WIDTH)
-        shape = keyframes.descriptors.shape
+        shape = descriptors.shape
         _require(shape[1:] == (width,), f"descriptors {shape} of width {width}")
     for i, camera in enumerate(keyframes.cameras):
         small = camera.short_side_resized(short_side)
-        cells = small.width // encoder.stride * (small.height // encoder.stride)
-        count = len(keyframes.inverse_depth[i])
-        _require(count == cells, f"keyframe {i}: {count} depths of {cells} cells")
+        columns = small.width // encoder.stride
+        rows = small.height // encoder.stride
+        depths = len(keyframes.inverse_depth[i])
+        _require(
+            depths == rows * columns,
+            f"keyframe {i}: {depths} depths of {rows}x{columns} cells",
+        )
 
 
 def _require_keyframe(keyframes: Keyframes, i: int) -> None:
+    name = f"keyframe {i}"
     camera = keyframes.cameras[i]
     size = (camera.width, camera.height)
-    require_image_size(*size, f"keyframe {i}")
-    stated = size_in_header(np.frombuffer(keyframes.images[i], np.uint8))
-    _require(stated == size, f"keyframe {i}: {stated} pixels, its camera {size}")
-    _require(max(size) <= bounds().map_side, f"keyframe {i}: {size} pixels")
+    require_image_size(*size, name)
+    most = bounds().map_side
+    _require(max(size) <= most, f"{name}: {size} pixels, at most {most} a side")
+    image = np.frombuffer(keyframes.images[i], np.uint8)
+    stated = size_in_header(image)
+    _require(stated == size, f"{name}: {stated} pixels, its camera {size}")
     marks = keyframes.landmarks[i]
     inside = (marks.pixels >= 0) & (marks.pixels < size)
     positive = np.minimum(marks.inverse_depth, marks.sigma) > 0
-    _require(inside.all() and positive.all(), f"keyframe {i}: landmarks out of range")
-    _require_finite("landmarks", marks.inverse_depth, marks.sigma, marks.slope)
+    _require(inside.all(), f"{name}: landmarks outside the image")
+    _require(positive.all(), f"{name}: landmarks without depth")
+    _require_finite(
+        f"{name}: landmarks",
+        marks.inverse_depth,
+        marks.sigma,
+        marks.slope,
+    )
 
 
 def _require_frame(frame: MapFrame) -> None:
@@ -66,8 +86,10 @@ def _require_frame(frame: MapFrame) -> None:
     covariance = frame.base_covariance
     if covariance is not None:
         least = np.linalg.eigvalsh(covariance)[0]
-        is_covariance = covariance.shape == (6, 6) and least > -1e-9
-        _require(is_covariance, "base_covariance is a covariance (6, 6)")
+        _require(
+            covariance.shape == (6, 6) and least > -1e-9,
+            "base_covariance is a covariance (6, 6)",
+        )
     correction = frame.correction
     if correction is not None:
         shape = (len(correction.poses), 6)
@@ -76,8 +98,9 @@ def _require_frame(frame: MapFrame) -> None:
 
 
 def _require_finite(name: str, *values: Any) -> None:
-    finite = [np.isfinite(part).all() for part in values]
-    _require(all(finite), f"{name}: numbers are finite")
+    for part in values:
+        finite = np.isfinite(part)
+        _require(finite.all(), f"{name}: numbers are finite")
 
 
 def _require(holds: object, what: str) -> None:

@@ -359,15 +359,12 @@ def _copy(
 def _require_listed(sizes: dict[str, int], manifest: Manifest, file: Path) -> None:
     """Refuse an archive whose files are not those of its manifest."""
     listed = {name: record["bytes"] for name, record in manifest.files.items()}
-    for name in sorted(sizes.keys() | listed.keys()):
-        if name not in listed:
-            raise InputError(f"{file}: {name} is not in its manifest")
-        if name not in sizes:
-            raise InputError(f"{file}: {name} is missing")
-        if sizes[name] != listed[name]:
-            raise InputError(
-                f"{file}: {name} has {sizes[name]} bytes, expected {listed[name]}"
-            )
+    if differing := sizes.items() ^ listed.items():
+        name, _ = min(differing)
+        raise InputError(
+            f"{file}: {name} has {sizes.get(name, 0)} bytes, expected"
+            f" {listed.get(name, 0)}; its manifest does not list these files"
+        )
 
 
 def _require_map_of(root: Path, file: Path) -> None:

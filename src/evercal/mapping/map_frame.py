@@ -247,4 +247,6 @@ def _closeness(
     metres = np.linalg.norm(poses.translation_m - pose.translation_m, axis=-1)
     cosine = np.abs(poses.rotation_wxyz @ pose.rotation_wxyz).clip(0, 1)
     angle = 2 * np.arccos(cosine)
-    return np.exp(-0.5 * (metres / radius[0]) ** 2 - 0.5 * (angle / radius[1]) ** 2)
+    far = metres / radius[0]
+    turned = angle / radius[1]
+    return np.exp(-0.5 * far**2 - 0.5 * turned**2)

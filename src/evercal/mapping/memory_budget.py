@@ -19,7 +19,13 @@ AUTO = "auto"
 FEW_KEYFRAMES = 8
 """The default keeps at least so many: two keyframes of a recording of 25 frames locate 76 to 91 %
 of its other frames within 1 cm, eight locate all (research/map.md)."""
-_UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9}
+_UNITS = {
+    "": 1,
+    "B": 1,
+    "KB": 10**3,
+    "MB": 10**6,
+    "GB": 10**9,
+}
 """Bytes of a decimal unit."""
 _UNITS |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
 _SAMPLED_FRAMES = 8

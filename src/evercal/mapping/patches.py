@@ -87,7 +87,9 @@ def cut_patches(image: Array, pixels: Array) -> Patches:
     """Patches of 11x11 pixels around (n, 2) pixels of a float image of one pyramid level."""
     n = len(pixels)
     centre = pixels.astype(np.float32)
-    wide = _sample(image, centre[:, :1] + _WIDE[:, 0], centre[:, 1:] + _WIDE[:, 1])
+    u = centre[:, :1] + _WIDE[:, 0]
+    v = centre[:, 1:] + _WIDE[:, 1]
+    wide = _sample(image, u, v)
     wide = wide.reshape(n, SIDE + 2, SIDE + 2)
     rows = wide[:, 1:-1]
     columns = wide[..., 1:-1]

@@ -85,7 +85,9 @@ class PoseSpace:
                 f"pose {int(np.argmax(bad))} is not finite or has a zero quaternion; "
                 "leave untracked frames out"
             )
-        extent = positions.max(0, initial=-np.inf) - positions.min(0, initial=np.inf)
+        greatest = positions.max(0, initial=-np.inf)
+        least = positions.min(0, initial=np.inf)
+        extent = greatest - least
         side = float(extent.max())
         if side <= 0:
             side = 1.0

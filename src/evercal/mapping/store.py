@@ -39,6 +39,7 @@ from evercal.storage.stages import (
     write_report,
 )
 from evercal.storage.tensors import load_tensors, open_tensors, save_tensors
+from evercal.storage.text_files import named_errors, refuse_repeated
 
 KIND = "map"
 """Kind of store in its manifest."""
@@ -199,19 +200,15 @@ class MapStore(StageStore[MapContents]):
 
 
 def stored_scenes(root: Path) -> list[tuple[str, Camera, dict[str, Any]]]:
-    """Name, adjusted camera and report of every scene of a map; no keyframes are read."""
+    """Name, adjusted camera and report of every scene of a map; the encoder is not read."""
 
     def read(manifest: Manifest) -> list[tuple[str, Camera, dict[str, Any]]]:
-        scenes = []
-        for name in require_map(root, manifest)["stages"]:
-            folder = root / STAGES / str(name)
-            with _of_evercal(folder):
-                scene = json.loads((folder / SCENE).read_text())
-                camera = Camera.from_dict(scene["adjusted_camera"])
-                name = checked_name(scene["name"])
-            scenes.append((name, camera, read_report(folder)))
-        _require_unique(root, [name for name, _, _ in scenes])
-        return scenes
+        stored = []
+        scenes = read_scenes(root, manifest)
+        for scene, stage in zip(scenes, manifest.payload["stages"], strict=True):
+            report = read_report(root / STAGES / stage)
+            stored.append((scene.name, scene.adjusted_camera, report))
+        return stored
 
     return read_store(root, read)
 
@@ -238,15 +235,6 @@ def require_map(root: Path, manifest: Manifest) -> dict[str, Any]:
             f"store {root}: {others[0]} in the manifest is no file of a map; restore it"
         )
     return payload
-
-
-def _require_unique(root: Path, names: Sequence[str]) -> None:
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(
-                f"store {root}: two scenes are named {name!r}; learn its scenes again into a new"
-                " map, or restore it from a copy"
-            )
 
 
 def write_scene(folder: Path, scene: SceneMap) -> None:
@@ -284,8 +272,10 @@ def _move(source: Path, target: Path) -> None:
 def read_scenes(root: Path, manifest: Manifest) -> list[SceneMap]:
     """The scenes that a manifest lists; two of one name are refused."""
     stages = require_map(root, manifest)["stages"]
-    scenes = [read_scene(root / STAGES / str(name)) for name in stages]
-    _require_unique(root, [scene.name for scene in scenes])
+    scenes = [read_scene(root / STAGES / name) for name in stages]
+    names = [scene.name for scene in scenes]
+    with named_errors(f"store {root}", "map"):
+        refuse_repeated(names, "learn its scenes again into a new map, or restore it")
     return scenes
 
 
@@ -399,6 +389,7 @@ def correction_tensors(correction: FrameCorrection) -> dict[str, NDArray[Any]]:
 
 def correction_of(tensors: Mapping[str, NDArray[Any]]) -> FrameCorrection:
     """The inverse of `correction_tensors`."""
-    poses = SE3(tensors["poses"][:, :4], tensors["poses"][:, 4:])
+    rows = tensors["poses"]
+    poses = SE3(rows[:, :4], rows[:, 4:])
     radius = _pair(tensors["radius"].tolist())
     return FrameCorrection(poses, tensors["correction"], radius)

@@ -283,7 +283,8 @@ def _residuals(
 
 def _in_front(points: Array) -> Array:
     """Points (n, 3) with a positive depth."""
-    return np.concatenate([points[:, :2], np.maximum(points[:, 2:], 1e-3)], 1)
+    depth = np.maximum(points[:, 2:], 1e-3)
+    return np.concatenate([points[:, :2], depth], 1)
 
 
 def _update_depths(
