@@ -51,6 +51,7 @@ VERBS = {
         "the right scene among 100,000 keyframes, milliseconds and bytes",
     ),
     "cluster": ("cluster", "learning and serving on a Ray cluster, beside one process"),
+    "mutants": ("mutants", "small changes of the code that the tests should notice"),
     "networks": ("networks", "the experiments on networks; the paper's table on a GPU"),
     "tables": ("tables", "print the tables of the docs from results/"),
 }

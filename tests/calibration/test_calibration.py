@@ -149,6 +149,38 @@ def test_the_noise_of_single_poses_is_no_error_of_the_calibration() -> None:
     # Two halves differ by twice the error of their mean.
     halves = calibration(0.5, 0.05, repeatability_mm=3.0)
     assert expected_error(halves) == pytest.approx((1.5, 0.05))
+    turned = calibration(0.5, 0.05, repeatability_deg=0.4)
+    assert expected_error(turned) == pytest.approx((0.5, 0.2))
+    small = calibration(0.5, 0.05, repeatability_mm=0.9, repeatability_deg=0.09)
+    assert expected_error(small) == pytest.approx((0.5, 0.05))
+
+
+@pytest.mark.parametrize(
+    ("mm", "advice"),
+    [
+        (0.5, "Check it on the robot before use"),
+        (2.0, "For precision assembly: more poses"),
+        (5.0, "For bin picking: more poses"),
+        (50.0, "For tabletop tasks: more poses"),
+    ],
+)
+def test_advice_is_for_the_next_better_use(mm: float, advice: str) -> None:
+    held = calibration(mm, 0.05, held_out_mm=2.0, held_out_deg=0.05)
+    assert advice in verdict(held)
+
+
+def test_a_verdict_says_what_is_known() -> None:
+    plain = verdict(calibration(2.0, 0.05))
+    assert plain == (
+        "Good for bin picking (within 3 mm and 0.3 deg). Expected error 2.00 mm and 0.05 deg."
+    )
+    half = calibration(20.0, 0.05, held_out_mm=2.0)
+    assert verdict(half) == (
+        "Unusable: even tabletop tasks ask for 10 mm and 1 deg."
+        " Expected error 20 mm and 0.05 deg."
+    )
+    held = verdict(calibration(2.0, 0.05, held_out_mm=9.994, held_out_deg=0.05))
+    assert "; single held-out poses differ by 9.99 mm and 0.05 deg (median)." in held
 
 
 def test_a_rotation_error_counts_at_the_target() -> None:

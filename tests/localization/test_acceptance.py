@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import betabinom
 
 from evercal.geometry import SE3, UncertainPose
 from evercal.localization.acceptance import (
@@ -12,6 +13,7 @@ from evercal.localization.acceptance import (
     SAME_SURFACE,
     support,
 )
+from evercal.localization.answer import differ, widening
 from evercal.localization.hypothesis import Rough, accepted
 
 
@@ -48,3 +50,56 @@ def test_the_rate_of_false_accepts_decides() -> None:
 def test_pose_without_inliers_is_never_accepted() -> None:
     for rejected in (None, hypothesis(0, 0), hypothesis(0, 900)):
         assert not accepted(rejected)
+
+
+def test_support_is_exact_where_few_landmarks_are_searched() -> None:
+    """Beside the sum over the distribution of SciPy."""
+    for inliers, expected in ((3, 6), (6, 6), (9, 30), (30, 30)):
+        n = expected // SAME_SURFACE
+        counts = np.arange(inliers // SAME_SURFACE, n + 1)
+        tail = betabinom(n, *CHANCE).pmf(counts).sum()
+        assert support(inliers, expected) == pytest.approx(-np.log10(tail), rel=1e-9)
+    # More inliers than landmarks that were searched are possible, and no error.
+    assert support(4, 3) >= support(3, 3)
+    # All is more likely than not: no support, and not less than none.
+    assert support(1, 900) == pytest.approx(0, abs=1e-6)
+    assert support(1, 900) >= 0
+
+
+def test_few_inliers_widen_the_covariance() -> None:
+    few = hypothesis(60, 200)
+    assert 4 < few.support < 36
+    assert widening(few) == pytest.approx(36 / few.support)
+    assert widening(hypothesis(190, 200)) == 1
+
+
+@pytest.mark.parametrize(
+    ("sigma", "moved", "different"),
+    [
+        (1e-4, [0.011, 0, 0, 0, 0, 0], True),
+        (1e-4, [0.009, 0, 0, 0, 0, 0], False),  # both are the same to a robot
+        (1e-4, [0, 0, 0, 0, 0, np.deg2rad(1.1)], True),
+        (1e-4, [0, 0, 0, 0, 0, np.deg2rad(0.9)], False),
+        (0.01, [0.049, 0, 0, 0, 0, 0], False),  # within the uncertainty of the pose
+        (0.01, [0.051, 0, 0, 0, 0, 0], True),
+        (0.01, [0, 0, 0, 0, 0.051, 0], True),
+    ],
+)
+def test_poses_differ_by_a_centimetre_or_a_degree_beyond_their_uncertainty(
+    sigma: float, moved: list[float], different: bool
+) -> None:
+    points = np.zeros((190, 3))
+    pose = UncertainPose(SE3.identity(), sigma**2 * np.eye(6))
+    sure = Rough(0, pose, points[:, :2], points, 200, 190)
+    assert differ(sure, SE3.exp(np.array(moved))) == different
+
+
+def test_a_wide_pose_differs_from_fewer_others() -> None:
+    points = np.zeros((60, 3))
+    pose = UncertainPose(SE3.identity(), 1e-4 * np.eye(6))
+    weak = Rough(0, pose, points[:, :2], points, 200, 60)
+    bound = 0.05 * np.sqrt(widening(weak))
+    assert bound > 0.06
+    for factor, different in ((0.99, False), (1.01, True)):
+        other = SE3.from_translation([factor * bound, 0, 0])
+        assert differ(weak, other) == different

@@ -19,10 +19,13 @@ from evercal.localization.intrinsics import (
     IntrinsicsPrior,
 )
 from evercal.localization.pose_refinement import (
+    SHARED,
     Minimum,
     Observed,
+    cells_of,
     linearise,
     minimise,
+    robust_variance,
 )
 from evercal.localization.self_calibration import self_calibrated
 from evercal.typing import Array
@@ -241,3 +244,69 @@ def test_a_far_camera_is_reached_by_repetition(factor: float) -> None:
     )
     assert result.pose.squared_mahalanobis(POSE) < 22.5
     assert pose_distance(result.pose.pose, POSE)[0] < 0.01
+
+
+def test_the_variance_is_that_of_gaussian_errors_whatever_a_third_of_them_is() -> None:
+    rng = np.random.default_rng(0)
+    squares = (rng.normal(0, 3.0, (40_000, 2)) ** 2).sum(1)
+    assert robust_variance(squares) == pytest.approx(9, rel=0.03)
+    squares[:12_000] = 1e6
+    assert robust_variance(squares) < 9 * 2.5
+    assert robust_variance(np.zeros(9)) == 0.05
+    assert robust_variance(np.array([1.0, 2.0, 1e9])) == pytest.approx(2 / 1.386)
+
+
+def test_cells_are_squares_of_a_quarter_of_the_shorter_side() -> None:
+    tall = replace(CAMERA, width=480, height=640)
+    for camera, cells in ((CAMERA, (6, 4)), (tall, (4, 6))):
+        grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)))
+        pixels = grid.reshape(2, -1).T[::7].astype(float)
+        found = cells_of(pixels, camera)
+        assert found.shape == (len(pixels), cells[0] * cells[1])
+        assert (found.sum(1) == 1).all()
+        for column in found.T.astype(bool):
+            assert np.ptp(pixels[column] // 120, axis=0).tolist() == [0, 0]
+
+
+def test_errors_that_a_cell_shares_do_not_average_out() -> None:
+    """The slow twin draws them: of each cell one error, beside those of single landmarks."""
+    rng = np.random.default_rng(5)
+    points_m = points(400, 5)
+    exact = project(points_m)
+    cells = cells_of(exact, CAMERA)
+    # The whitening says 1, so the variance is 4 and the shared part 16 SHARED.
+    sigma = 2.0
+    drawn = []
+    claimed = []
+    alone = []
+    for _ in range(150):
+        noise = sigma * rng.normal(size=exact.shape)
+        common = sigma**2 * np.sqrt(SHARED) * rng.normal(size=(cells.shape[1], 2))
+        seen = Observed(exact + noise + cells @ common, points_m, precise(400, 1.0))
+        found = minimise(seen, CAMERA, matrix_and_position(POSE))
+        drawn.append(found.position - POSE.translation_m)
+        for of, matrix in ((claimed, cells), (alone, np.eye(len(cells)))):
+            covariance = found.covariance(np.zeros(0), matrix)
+            of.append(found.pose(covariance).covariance[:3, :3])
+    true = np.cov(np.array(drawn).T)
+    ratio = np.linalg.eigvals(np.linalg.solve(true, np.mean(claimed, 0))).real
+    # Landmarks share errors with Cauchy's weight, of mean a, and move the pose by its square, of
+    # mean b, see above: the claim is (a / b)^2 = 2.9 times as large.
+    assert 2.2 < np.exp(np.log(ratio).mean()) < 4.2
+    assert np.trace(np.mean(claimed, 0)) > 2 * np.trace(np.mean(alone, 0))
+
+
+def test_other_intrinsics_that_are_held_move_the_pose() -> None:
+    """Beside the minimum with the other intrinsics."""
+    seen = seen_with(np.zeros(5), 3, 3.0, 0.0)
+    free = np.full(5, 1e-2)
+    start = matrix_and_position(POSE)
+    slope = minimise(seen, CAMERA, start, 10, free).by_intrinsics()
+    for column, step in enumerate([1e-3, 1.0, 1.0, 1e-3, 1e-3]):
+        change = step * np.eye(5)[column]
+        found = minimise(seen, CAMERA.changed(change), start, 20)
+        shift = POSE.rotation_matrix().T @ (found.position - POSE.translation_m)
+        turn = Rotation.from_matrix(POSE.rotation_matrix().T @ found.rotation)
+        moved = np.concatenate([shift, turn.as_rotvec()])
+        expected = step * slope[:, column]
+        assert np.linalg.norm(moved - expected) < 0.05 * np.linalg.norm(expected)
