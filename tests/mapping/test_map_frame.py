@@ -153,3 +153,160 @@ def test_common_motion_of_the_cameras_moves_the_base_frame() -> None:
     errors = (POSE @ SE3.exp(draws) @ POSE.inverse()).log()
     sampled = errors.T @ errors / len(errors)
     np.testing.assert_allclose(frame, sampled, atol=0.02 * np.trace(sampled))
+
+
+def test_a_correction_fades_with_distance_and_angle() -> None:
+    """One frame: its correction counts with a Gaussian weight beside a zero that counts 0.3."""
+    correction = np.array([[0.01, 0.02, -0.01, 0.002, 0.0, 0.001]])
+    one = FrameCorrection(SE3.stack([POSE]), correction, (0.2, 0.25))
+    near = one.at(POSE)
+    np.testing.assert_allclose(near, correction[0] / 1.3)
+    for shift, turn, sigmas in (
+        (0.2, 0, 1),
+        (0, 0.25, 1),
+        (0.6, 0, 3),
+        (0.2, -0.5, 5**0.5),
+    ):
+        moved = (
+            SE3.from_translation([0, shift, 0]) @ POSE @ SE3.exp([0, 0, 0, 0, turn, 0])
+        )
+        # A rotation about the camera leaves its position.
+        weight = np.exp(-0.5 * sigmas**2)
+        expected = correction[0] * weight / (weight + 0.3)
+        np.testing.assert_allclose(one.at(moved), expected, rtol=1e-6, atol=1e-12)
+    # Quaternions of either sign are one rotation.
+    same = SE3(-POSE.rotation_wxyz, POSE.translation_m)
+    np.testing.assert_allclose(one.at(same), near)
+
+
+def left_out(
+    poses: SE3, correction: np.ndarray, metres: float, degrees: float
+) -> np.ndarray:
+    """What the others predict of each frame, one after the other."""
+    rows = []
+    radius = (metres, float(np.deg2rad(degrees)))
+    for i, pose in enumerate(poses):
+        others = np.delete(np.arange(len(poses)), i)
+        rest = FrameCorrection(poses[others], correction[others], radius)
+        rows.append(rest.at(pose))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("spacing", [0.03, 0.12, 0.3])
+def test_the_length_that_predicts_left_out_frames_best_is_chosen(
+    spacing: float,
+) -> None:
+    rng = np.random.default_rng(3)
+    along = spacing * np.arange(40)
+    zero = np.zeros(40)
+    poses = SE3.exp(np.stack([along, zero, zero, 0.3 * along, zero, zero], -1))
+    wave = np.sin(along / (4 * spacing))
+    correction = np.outer(wave, [0.01, 0, 0.005, 0.004, 0.002, 0])
+    correction += rng.normal(0, [0.002] * 3 + [0.001] * 3, (40, 6))
+    size = np.abs(correction)
+    scale = np.repeat([size[:, :3].mean(), size[:, 3:].mean()], 3)
+    explained = {}
+    for metres, degrees in ((0.1, 10.0), (0.2, 15.0), (0.4, 25.0)):
+        left = correction - left_out(poses, correction, metres, degrees)
+        ratio = ((left / scale) ** 2).sum() / ((correction / scale) ** 2).sum()
+        explained[metres] = 1 - ratio
+    best = max(explained, key=lambda metres: explained[metres])
+    assert explained[best] > 0.3
+    fitted = fit_correction(poses, correction)
+    assert fitted is not None
+    assert fitted.radius[0] == best
+
+
+@pytest.mark.parametrize(("metres", "radians"), [(0.5e-4, 1e-3), (1e-3, 0.5e-5)])
+def test_corrections_too_small_to_measure_are_not_predicted(
+    metres: float, radians: float
+) -> None:
+    poses = walk(200, np.random.default_rng(0))
+    size = np.repeat([metres, radians], 3)
+    wave = np.sign(smooth(poses)) + (smooth(poses) == 0)
+    assert fit_correction(poses, size * wave) is None
+    assert fit_correction(poses, 2.1 * size * wave) is not None
+
+
+def test_share_of_corrections_that_must_be_explained() -> None:
+    """Noise hides a slow correction: it is predicted while 30 % of the variance are explained."""
+    rng = np.random.default_rng(4)
+    poses = walk(80, rng)
+    noise = rng.normal(0, [0.006] * 3 + [0.003] * 3, (80, 6))
+    found = set()
+    for factor in np.linspace(0, 2, 9):
+        correction = factor * smooth(poses) + noise
+        scale = np.repeat(
+            [np.abs(correction[:, :3]).mean(), np.abs(correction[:, 3:]).mean()], 3
+        )
+        explained = []
+        for metres, degrees in ((0.1, 10.0), (0.2, 15.0), (0.4, 25.0)):
+            left = correction - left_out(poses, correction, metres, degrees)
+            ratio = ((left / scale) ** 2).sum() / ((correction / scale) ** 2).sum()
+            explained.append(1 - ratio)
+        fitted = fit_correction(poses, correction) is not None
+        assert fitted == (max(explained) > 0.3)
+        found.add(fitted)
+    assert found == {True, False}
+
+
+def test_shared_errors_are_those_that_neighbours_leave_correlated() -> None:
+    rng = np.random.default_rng(6)
+    poses = walk(100, rng)
+    slow = smooth(poses)
+    fitted = fit_correction(poses, slow)
+    assert fitted is not None
+    # What a fitted correction predicts is undone, and no error of the stated frame.
+    noise = rng.normal(0, [0.004] * 3 + [0.003] * 3, (100, 6))
+    alone = shared_sigma(poses, slow + noise, None)
+    assert min(alone) > 0
+    assert shared_sigma(poses, slow + noise, fitted) == (0.0, 0.0)
+    # Shorter than the correlation length of the prediction, but longer than a frame.
+    quick = np.repeat(rng.normal(0, [0.02] * 3 + [0.01] * 3, (25, 6)), 4, 0)
+    metres, radians = shared_sigma(poses, slow + quick, fitted)
+    both = slow + quick
+    assert metres == pytest.approx(np.sqrt((both[:, :3] ** 2).mean()))
+    assert radians == pytest.approx(np.sqrt((both[:, 3:] ** 2).mean()))
+
+
+def test_shared_errors_are_three_standard_errors_from_none() -> None:
+    """Independent errors of many draws: about one in a thousand is called shared."""
+    rng = np.random.default_rng(7)
+    poses = walk(30, rng)
+    draws = rng.normal(0, 0.004, (1000, 30, 6))
+    found = [shared_sigma(poses, draw, None) for draw in draws]
+    shared = np.array(found) > 0
+    assert shared.mean() < 0.01
+    # A correlation of a half between neighbours is above it in 90 images.
+    many = rng.normal(0, 0.004, (300, 91, 6))
+    correlated = (many[:, 1:] + many[:, :-1]) / np.sqrt(2)
+    found = [shared_sigma(walk(90, rng), draw, None) for draw in correlated[:50]]
+    assert (np.array(found) > 0).mean() > 0.95
+
+
+def test_numbers_of_a_frame_without_and_with_a_similarity_and_a_correction() -> None:
+    plain = MapFrame(frame_sigma=(0.003, 0.02))
+    assert plain.scale == 1
+    assert plain.shared_m == 0.003
+    np.testing.assert_array_equal(plain.slope, np.eye(6))
+    correction = random_correction(0)
+    frame = MapFrame(
+        correction=correction, frame_sigma=(0.003, 0.02), similarity=SIMILARITY
+    )
+    assert frame.scale == 0.37
+    metres = np.sqrt((correction.correction[:, :3] ** 2).mean())
+    assert frame.shared_m == pytest.approx(metres)
+    # An answer beside a moved pose among the landmarks.
+    for axis in range(6):
+        step = 1e-6 * np.eye(6)[axis]
+        turned = POSE @ SE3.exp(np.r_[np.zeros(3), step[3:]])
+        moved = SE3(turned.rotation_wxyz, POSE.translation_m + step[:3])
+        before, after = (
+            MapFrame(similarity=SIMILARITY).to_base(UncertainPose.exact(pose)).pose
+            for pose in (POSE, moved)
+        )
+        shift = after.translation_m - before.translation_m
+        turn = (before.inverse() @ after).log()[3:]
+        np.testing.assert_allclose(
+            frame.slope[:, axis], np.concatenate([shift, turn]) / 1e-6, atol=1e-6
+        )
