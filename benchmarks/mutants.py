@@ -20,7 +20,7 @@ from pathlib import Path
 import pandas as pd
 from tyro.conf import Positional
 
-from benchmarks.mutation import Mutation, drawn
+from benchmarks.mutation import drawn
 from benchmarks.rows import Row, once, save, show
 from evercal.errors import InputError
 from evercal.processes import python_command
@@ -39,7 +39,7 @@ def run(
     seed: int = 1,
     count: int = 12,
     tests: tuple[Path, ...] = (),
-    seconds: float = 90.0,
+    seconds: float = 60.0,
     out: Path = Path("runs/mutants"),
 ) -> None:
     """Change files in a copy of the source, and run the tests that execute the changed lines.
@@ -68,10 +68,14 @@ def run(
     for name in names:
         for mutant in drawn((tree / name).read_text("utf-8"), count, f"{seed} {name}"):
             chosen = _chosen(executed, tree / name, mutant.line, seconds)
-            row = {"seed": seed, "file": name, **_tried(tree / name, mutant, chosen)}
+            row: Row = {"seed": seed, "file": name, "tests": len(chosen)}
+            row |= {"line": mutant.line, "function": mutant.function}
+            row["change"] = mutant.change
+            row["outcome"] = _outcome(tree, tree / name, mutant.source, chosen)
             print(*row.values(), flush=True)
             rows.append(row)
-    table = pd.DataFrame(rows).merge(pd.read_csv(JUDGED), "left")
+    judged = pd.read_csv(JUDGED, keep_default_na=False)
+    table = pd.DataFrame(rows).merge(judged, "left")
     same = table["why"].notna() & (table["outcome"] == "survived")
     table.loc[same, "outcome"] = "equivalent"
     settings = {"seed": seed, "count": count, "seconds": seconds}
@@ -90,7 +94,7 @@ def _executed(tree: Path, test: str, names: Sequence[str]) -> Row:
         lines = (tree / "lines.json").read_text()
         return {"lines": lines, "seconds": time.perf_counter() - began}
 
-    return once(_kept(tree, [test], " ".join(files)), measure)
+    return once(_kept(tree, [*files, test]), measure)
 
 
 def _chosen(
@@ -104,6 +108,8 @@ def _chosen(
         if lines:
             order = (line not in lines, Path(test).name != own, row["seconds"], test)
             found.append(order)
+    if not found:
+        raise InputError(f"no test executes {file.name}; name others by --tests")
     chosen = list[str]()
     for elsewhere, _, time_s, test in sorted(found):
         seconds -= float(time_s)
@@ -112,26 +118,24 @@ def _chosen(
     return chosen
 
 
-def _tried(file: Path, mutant: Mutation, chosen: Sequence[str]) -> Row:
-    """Run tests on a mutant until one fails."""
-    tree = next(above for above in file.parents if above.name == "tree")
+def _outcome(tree: Path, file: Path, source: str, chosen: Sequence[str]) -> str:
+    """Whether a test fails with another source of a file."""
 
     def measure() -> Row:
         before = file.read_bytes()
-        file.write_text(mutant.source, "utf-8")
+        file.write_text(source, "utf-8")
         status = _status(tree, [], chosen)
         file.write_bytes(before)
         return {"outcome": "killed" if status else "survived"}
 
-    row: Row = {"line": mutant.line, "function": mutant.function}
-    row |= {"change": mutant.change, "tests": len(chosen)}
-    return row | once(_kept(tree, chosen, mutant.source), measure)
+    files = [*map(str, sorted(tree.rglob("*.py"))), *chosen]
+    return str(once(_kept(tree, files, source), measure)["outcome"])
 
 
-def _kept(tree: Path, files: Sequence[str], words: str) -> Path:
-    """The file for what was measured with this source and the contents of some files."""
-    digest = hashlib.sha256(words.encode())
-    for file in [*sorted(tree.rglob("*.py")), *files]:
+def _kept(tree: Path, files: Sequence[str], words: str = "") -> Path:
+    """The file for what was measured with these files."""
+    digest = hashlib.sha256("\0".join([*files, words]).encode())
+    for file in files:
         digest.update(Path(file).read_bytes())
     return tree.parent / f"{digest.hexdigest()[:16]}.json"
 

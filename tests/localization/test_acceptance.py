@@ -57,7 +57,7 @@ def test_support_is_exact_where_few_landmarks_are_searched() -> None:
     for inliers, expected in ((3, 6), (6, 6), (9, 30), (30, 30)):
         n = expected // SAME_SURFACE
         counts = np.arange(inliers // SAME_SURFACE, n + 1)
-        tail = betabinom(n, *CHANCE).pmf(counts).sum()
+        tail = betabinom.pmf(counts, n, *CHANCE).sum()
         assert support(inliers, expected) == pytest.approx(-np.log10(tail), rel=1e-9)
     # More inliers than landmarks that were searched are possible, and no error.
     assert support(4, 3) >= support(3, 3)
