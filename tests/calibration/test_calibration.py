@@ -179,8 +179,15 @@ def test_a_verdict_says_what_is_known() -> None:
         "Unusable: even tabletop tasks ask for 10 mm and 1 deg."
         " Expected error 20 mm and 0.05 deg."
     )
-    held = verdict(calibration(2.0, 0.05, held_out_mm=9.994, held_out_deg=0.05))
-    assert "; single held-out poses differ by 9.99 mm and 0.05 deg (median)." in held
+    for mm, words in ((9.994, "9.99 mm"), (10.0, "10 mm"), (10.6, "11 mm")):
+        held = verdict(calibration(2.0, 0.05, held_out_mm=mm, held_out_deg=0.05))
+        assert f"; single held-out poses differ by {words} and 0.05 deg" in held
+
+
+def test_an_error_of_just_a_bound_is_not_below_it() -> None:
+    small = calibration(0.1, 0.01)
+    for checks in ({"repeatability_mm": 2.0}, {"repeatability_deg": 0.2}):
+        assert tier(replace(small, checks=checks_of(checks))) is TIERS[1]
 
 
 def test_a_rotation_error_counts_at_the_target() -> None:

@@ -111,6 +111,12 @@ def test_axis_deviation() -> None:
     ) == pytest.approx((3**0.5, np.rad2deg(0.01)))
 
 
+def test_deviations_of_a_pose_are_those_of_its_axes() -> None:
+    pose = UncertainPose(FIRST, np.diag([1e-6, 4e-6, 4e-6, 1e-4, 1e-4, 1e-4]))
+    assert pose.sigma_mm == pytest.approx(3**0.5)
+    assert pose.sigma_deg == pytest.approx(np.rad2deg(0.01))
+
+
 def test_batches_and_other_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match=r"covariance \(6, 6\)"):
         UncertainPose(SE3.identity((2,)), np.eye(6))

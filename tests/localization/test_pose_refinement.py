@@ -156,6 +156,15 @@ def test_derivatives_equal_finite_differences(lens: tuple[float, ...]) -> None:
         np.testing.assert_allclose(slope[column], numeric, rtol=1e-4, atol=1e-3)
 
 
+def test_points_behind_the_camera_count_as_a_millimetre_ahead() -> None:
+    pixels = np.zeros((3, 2))
+    depths = np.array([[0.1, -0.2, -2.0], [0.1, -0.2, 0.0], [0.1, -0.2, 1e-3]])
+    error, slope = linearise(pixels, depths, np.eye(3), np.zeros(3), CAMERA, True)
+    ahead = CAMERA.project(depths[2])
+    np.testing.assert_allclose(error.T, [ahead, ahead, ahead])
+    np.testing.assert_allclose(slope[..., :2], slope[..., [2, 2]])
+
+
 def test_matches_without_a_common_pose_do_not_diverge() -> None:
     """Ten steps with free intrinsics lead nowhere, and not out of the world."""
     variances = np.array([2e-8, 5e-3, 5e-3, 6e-7, 6e-7])
