@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from benchmarks.malformed import malformed
 from evercal.bounds import RequestBounds
+
+from .malformed import malformed
 
 # The parser of forms leaves the last part of a truncated body to the garbage collector.
 pytestmark = pytest.mark.filterwarnings(

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.malformed import png
 from evercal.bounds import RequestBounds
 from evercal.map import Map
 from evercal.recordings import read_image
 from evercal.reports.answers import Answer, answer_row
+
+from .malformed import png
 
 
 def test_localize_gives_the_row_of_the_command(hall_service, hall_store, image, hall):
