@@ -74,6 +74,8 @@ class RequestBounds(Bounds):
     """Numbers of an array, and cells of a table."""
     pixels: int = 16_000_000
     """Pixels of one image."""
+    header_bytes: int = 32 * 1024
+    """Headers and path of a request."""
     body_bytes: int = 128 * 10**6
     """Body of a request with images."""
     request_pixels: int = 300 * 10**6
@@ -81,9 +83,9 @@ class RequestBounds(Bounds):
     images: int = 500
     """Images of one calibration."""
     requests: int = 64
-    """Requests with a body under way; those beyond are refused with status 429."""
+    """Requests whose body has arrived; those beyond are refused with status 429."""
     held_bytes: int = 256 * 10**6
-    """Bytes of their bodies."""
+    """Bytes of bodies that have arrived."""
     connections: int = 100
     """Open connections; the oldest without a request gives way to a new one."""
     streams: int = 8
@@ -93,9 +95,9 @@ class RequestBounds(Bounds):
     stream_bytes: int = 32 * 10**6
     """Frames of a stream that wait; the rest waits at the client."""
     wait_s: float = 10.0
-    """Time for headers, for reading an answer, and for a body beyond its length, seconds."""
+    """Time for headers, for the next part of a body, and for reading an answer, seconds."""
     bytes_per_s: float = 250_000.0
-    """Slowest body."""
+    """Slowest body, after `wait_s`."""
 
 
 _of_request: ContextVar[RequestBounds | None] = ContextVar("_of_request", default=None)

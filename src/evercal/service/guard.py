@@ -3,7 +3,7 @@
 import asyncio
 import hmac
 import time
-from collections.abc import Awaitable, Callable, MutableMapping
+from collections.abc import Awaitable, Callable, Iterable, MutableMapping
 from contextlib import suppress
 from typing import Any
 
@@ -20,6 +20,10 @@ Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Message, Receive, Send], Awaitable[None]]
 OPEN = ("/", "/health", "/docs", "/openapi.json")
 """Paths without a token: they reveal nothing of the map."""
+CROWDED = "too many requests wait; try again"
+"""Of a request that is refused with status 429."""
+STOPPED = "the service is being stopped; ask again"
+"""Of a request that is refused with status 503."""
 PAGES = "/pages/"
 """Beginning of the paths of files of the page, which need no token either."""
 SECURE = {
@@ -59,26 +63,39 @@ class Metrics:
 
 
 class _Body:
-    """The body of a request, which is refused with status 408 if it takes too long."""
+    """The body of a request, as far as it has arrived.
 
-    def __init__(self, receive: Receive, seconds: float):
+    It is refused with status 408 if no part of it arrives for a while, or if all of it is too slow,
+    and with status 429 if the bodies that have arrived would take too much memory.
+    """
+
+    def __init__(self, receive: Receive, limits: RequestBounds, bodies: "set[_Body]"):
+        self.arrived = 0
+        self.ended = False
         self._receive = receive
-        self._latest = time.perf_counter() + seconds
-        self._ended = False
+        self._limits = limits
+        self._bodies = bodies
+        self._began = time.perf_counter()
 
     async def part(self) -> Message:
         """The next message; after the last part the end of the connection."""
         seconds = None
-        if not self._ended:
-            seconds = max(self._latest - time.perf_counter(), 0.0)
+        if not self.ended:
+            limits = self._limits
+            passed = time.perf_counter() - self._began
+            allowed = limits.wait_s + self.arrived / limits.bytes_per_s
+            seconds = min(limits.wait_s, max(allowed - passed, 0.0))
         try:
             message = await asyncio.wait_for(self._receive(), seconds)
         except TimeoutError:
-            self._ended = True
+            self.ended = True
             raise HTTPException(
                 408, "the body did not arrive in time; send it again"
             ) from None
-        self._ended = not message.get("more_body", False)
+        self._count(message)
+        crowded = held_bytes(self._bodies) > self._limits.held_bytes
+        if crowded and message.get("body"):
+            raise HTTPException(429, CROWDED)
         return message
 
     async def discard(self) -> None:
@@ -86,17 +103,27 @@ class _Body:
 
         A connection that is closed with unread bytes is reset: the answer would be lost.
         """
-        with suppress(TimeoutError, HTTPException):
+        self._bodies.discard(self)
+        with suppress(TimeoutError):
             async with asyncio.timeout(1.0):
-                while not self._ended:
-                    await self.part()
+                while not self.ended:
+                    self._count(await self._receive())
+
+    def _count(self, message: Message) -> None:
+        self.arrived += len(message.get("body", b""))
+        self.ended = not message.get("more_body", False)
+
+
+def held_bytes(bodies: Iterable[_Body]) -> int:
+    """Bytes of bodies that have arrived."""
+    return sum(body.arrived for body in bodies)
 
 
 class Guard:
     """Refuses requests before their body is read; an ASGI middleware.
 
-    Without a token, only this machine may ask. The bodies of the requests under way are counted:
-    those beyond the limits wait at the client.
+    Without a token, only this machine may ask. What has arrived of the bodies is counted: a request
+    beyond the limits is refused, and a client that stops half way holds nobody else.
     """
 
     def __init__(
@@ -106,7 +133,7 @@ class Guard:
         self._limits = limits
         self._metrics = metrics
         self._token = None if token is None else token.encode()
-        self._bodies: dict[object, int] = {}
+        self._bodies: set[_Body] = set()
         self._streams = 0
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
@@ -116,16 +143,15 @@ class Guard:
         headers = dict(scope["headers"])
         # The server has checked that it is one.
         length = int(headers.get(b"content-length", b"0"))
-        refusal = self._refusal(scope["path"], headers, length)
+        refusal = self._refusal(scope, headers, length)
         if scope["type"] == "websocket":
             return await self._stream(refusal, scope, receive, send)
         app = self._app
         if refusal is not None:
             app = _refused(*refusal)
         began = time.perf_counter()
-        status = 500
-        seconds = self._limits.wait_s + length / self._limits.bytes_per_s
-        body = _Body(receive, seconds)
+        status = 0
+        body = _Body(receive, self._limits, self._bodies)
 
         async def counted(message: Message) -> None:
             nonlocal status
@@ -138,16 +164,21 @@ class Guard:
             await send(message)
 
         if refusal is None and length:
-            self._bodies[body] = length
+            self._bodies.add(body)
         try:
             await app(scope, body.part, counted)
+        except asyncio.CancelledError:
+            # The server has been stopped, and its patience is over.
+            if status:
+                raise
+            await _refused(503, STOPPED)(scope, body.part, counted)
         finally:
-            self._bodies.pop(body, None)
+            self._bodies.discard(body)
             route = getattr(scope.get("route"), "path", "other")
             method = scope["method"]
             if method not in _METHODS:
                 method = "other"
-            self._metrics.requests.labels(method, route, status).inc()
+            self._metrics.requests.labels(method, route, status or 500).inc()
             self._metrics.seconds.labels(route).observe(time.perf_counter() - began)
 
     async def _stream(
@@ -170,9 +201,10 @@ class Guard:
             self._streams -= 1
 
     def _refusal(
-        self, path: str, headers: dict[bytes, bytes], length: int
+        self, scope: Message, headers: dict[bytes, bytes], length: int
     ) -> tuple[int, str] | None:
         """Status and reason for refusing a request."""
+        path = scope["path"]
         if self._token is not None and path not in OPEN and not path.startswith(PAGES):
             given = headers.get(b"authorization", b"")
             # Compared in constant time, so that its duration reveals nothing of the token.
@@ -185,6 +217,13 @@ class Guard:
             stated = None if origin is None else origin.decode("latin-1")
             if reason := foreign(host, stated, local=True):
                 return 403, f"{reason}; a token is needed"
+        parts = [scope.get("raw_path") or b"", scope["query_string"]]
+        for pair in scope["headers"]:
+            parts += pair
+        size = sum(map(len, parts))
+        if size > self._limits.header_bytes:
+            most = self._limits.header_bytes
+            return 431, f"headers and path of {size} bytes; at most {most}"
         kind = headers.get(b"content-type", b"").lower()
         # Some take very long, or break names.
         if b"charset" in kind and b"utf-8" not in kind:
@@ -194,10 +233,11 @@ class Guard:
         if length > self._limits.body_bytes:
             most = self._limits.body_bytes
             return 413, f"body of {str(length)[:20]} bytes; at most {most}"
-        held_bytes = sum(self._bodies.values()) + length
-        crowded = len(self._bodies) >= self._limits.requests
-        if length and (crowded or held_bytes > self._limits.held_bytes):
-            return 429, "too many requests wait; try again"
+        held = held_bytes(self._bodies) + length
+        waiting = sum(body.ended for body in self._bodies)
+        crowded = waiting >= self._limits.requests or held > self._limits.held_bytes
+        if length and crowded:
+            return 429, CROWDED
         return None
 
 

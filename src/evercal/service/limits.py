@@ -39,6 +39,7 @@ class Sent(Sequence[tuple[str, np.ndarray]]):
     def __init__(self, files: Sequence[tuple[str, bytes]], limits: RequestBounds):
         if len(files) > limits.images:
             raise TooLargeError(f"images: {len(files)} given; at most {limits.images}")
+        self.before_image: Callable[[], None] = lambda: None
         self._files = files
         self._limits = limits
 
@@ -67,6 +68,7 @@ class Sent(Sequence[tuple[str, np.ndarray]]):
         return len(self._files)
 
     def __getitem__(self, index: Any) -> Any:
+        self.before_image()
         name, data = self._files[index]
         return name, decoded(data, name, self._limits)
 

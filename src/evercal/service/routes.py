@@ -27,7 +27,7 @@ from evercal.calibration.image_source import Images
 from evercal.errors import InputError, UnavailableError
 from evercal.reports.answers import Answer, answer_row, check_record, unit_known
 from evercal.robot.mount import MountName
-from evercal.service.desk import Desk
+from evercal.service.desk import Check, Desk
 from evercal.service.guard import Metrics
 from evercal.service.limits import (
     Sent,
@@ -114,14 +114,17 @@ async def scenes(service: Asked) -> dict[str, Any]:
 
 @router.post("/localize", dependencies=[form("image", "camera")])
 async def localize(
-    service: Asked, image: UploadFile, camera: CameraFile = None
+    service: Asked,
+    request: Request,
+    image: UploadFile,
+    camera: CameraFile = None,
 ) -> dict[str, Any]:
     """Estimate the camera pose of one image: the row of `evercal localize --json`."""
     name = _name(image, "image")
     data = await image.read()
     intrinsics = await _content(camera)
 
-    def work() -> dict[str, Any]:
+    def work(_: Check) -> dict[str, Any]:
         localizer = service.live.localizer
         began = time.perf_counter()
         pixels = decoded(data, name, service.limits)
@@ -132,7 +135,7 @@ async def localize(
         known = unit_known(localizer, estimate.scene)
         return answer_row(Answer(Path(name), estimate, milliseconds, known))
 
-    row = await service.desk.run(work)
+    row = await service.desk.run(work, request)
     service.metrics.answers.labels(row["status"]).inc()
     return row
 
@@ -142,7 +145,7 @@ async def _images(
     files: list[UploadFile],
     camera: UploadFile | None,
     robot_poses: UploadFile | None,
-) -> Callable[[], Images]:
+) -> Callable[[Check], Images]:
     """A function that decodes the images of a request, with their camera and robot poses."""
     contents = []
     for i, file in enumerate(files):
@@ -151,7 +154,8 @@ async def _images(
     intrinsics = await _content(camera)
     table = await _content(robot_poses)
 
-    def decode() -> Images:
+    def decode(check: Check) -> Images:
+        sent.before_image = check
         sent.check_pixels()
         poses = None
         if robot_poses is not None and table is not None:
@@ -168,6 +172,7 @@ async def _images(
 )
 async def calibrations(
     service: Asked,
+    request: Request,
     images: Shots,
     camera: CameraFile = None,
     robot_poses: PosesFile = None,
@@ -176,10 +181,11 @@ async def calibrations(
     """Calibrate a camera from its images: the calibration file."""
     decode = await _images(service, images, camera, robot_poses)
 
-    def work() -> dict[str, Any]:
-        return calibrate(service.live.localizer, decode(), mount).to_dict()
+    def work(check: Check) -> dict[str, Any]:
+        given = decode(check)
+        return calibrate(service.live.localizer, given, mount).to_dict()
 
-    return await service.desk.run(work)
+    return await service.desk.run(work, request)
 
 
 @router.post(
@@ -188,6 +194,7 @@ async def calibrations(
 )
 async def check(
     service: Asked,
+    request: Request,
     images: Shots,
     calibration: Annotated[
         UploadFile, File(description="The calibration file of the camera.")
@@ -199,9 +206,9 @@ async def check(
     decode = await _images(service, images, camera, robot_poses)
     content = await calibration.read()
 
-    def work() -> dict[str, Any]:
+    def work(check: Check) -> dict[str, Any]:
         reference = calibration_of(content)
-        given = decode()
+        given = decode(check)
         shift = drift.check(
             service.live.localizer,
             given.images,
@@ -211,7 +218,7 @@ async def check(
         )
         return check_record(shift)
 
-    return await service.desk.run(work)
+    return await service.desk.run(work, request)
 
 
 def _name(file: UploadFile, default: str) -> str:
@@ -247,7 +254,7 @@ async def track(socket: WebSocket, service: Asked, newest: bool = False) -> None
 
     async def row(frame: Frame) -> dict[str, Any]:
         try:
-            return await service.desk.run(tracker.row, frame)
+            return await service.desk.run(lambda _: tracker.row(frame))
         except InputError as error:
             if isinstance(error, UnavailableError):
                 service.live.distrust()

@@ -30,10 +30,10 @@ POLL_S = 0.5
 """Interval of the search for changes that other processes make to the map."""
 DRAIN_S = 30
 """Time that requests get to finish when the service is stopped."""
+WORK_S = 20
+"""After this time of it, work is asked to end before its next image."""
 LEAST_TOKEN = 16
 """Characters of a token, at least."""
-HEADER_BYTES = 32 * 1024
-"""Path and headers of a request."""
 
 
 @dataclass(frozen=True)
@@ -161,16 +161,25 @@ def url_of(listener: socket.socket) -> str:
     return hosts.url_of(*listener.getsockname()[:2])
 
 
+class _Server(uvicorn.Server):
+    """A server whose work ends in time when it is stopped."""
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        desk = self.config.app.state.service.desk  # pyright: ignore
+        asyncio.get_running_loop().call_later(WORK_S, desk.stop)
+        await super().shutdown(sockets)
+
+
 def server_of(app: FastAPI, limits: RequestBounds) -> uvicorn.Server:
     """The server of what `make_app` returns."""
     # It logs every malformed form.
     logging.getLogger("python_multipart").setLevel(logging.CRITICAL)
     requests, streams = protocols(limits)
-    return uvicorn.Server(
+    return _Server(
         uvicorn.Config(
             app,
             http=requests,
-            h11_max_incomplete_event_size=HEADER_BYTES,
+            h11_max_incomplete_event_size=limits.header_bytes,
             ws=streams,
             ws_max_size=limits.frame_bytes,
             ws_per_message_deflate=False,
