@@ -85,7 +85,8 @@ class Adjusted:
         tangent = adjustment.common.log()
         covariance = adjustment.common_covariance + adjustment.common_systematic
         size = (stated.width, stated.height)
-        corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size - 0.5
+        unit_square = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
+        corners = unit_square * size - 0.5
         moved = np.linalg.norm(
             camera.project(stated.unproject(corners)) - corners, axis=-1
         )

@@ -85,7 +85,8 @@ def pose_sigma(
         if k.mean() < RESOLVED_SHARE:
             estimated[axes] = before / UNRESOLVED_SHRINKAGE
             continue
-        excess = (weight * (errors[:, axes] ** 2 - posterior[:, axes] * k)).sum()
+        excess = errors[:, axes] ** 2 - posterior[:, axes] * k
+        excess = (weight * excess).sum()
         independent = np.sqrt(max(excess, 0.0) / (k**2).sum())
         estimated[axes] = independent.clip(
             before / MOST_SHRINKAGE, before * MOST_GROWTH
