@@ -31,7 +31,7 @@ from evercal.geometry import SE3, Camera
 from evercal.map import Map
 from evercal.recordings.frame import Frame, Recording
 from evercal.simulation.box_room import BoxRoom, default_camera
-from evercal.simulation.fisheye import fisheye_image
+from rooms.fisheye import fisheye_image
 from rooms.paths import sweep_shots
 from rooms.renderer import Renderer, RenderOptions
 from rooms.room import room as furnished_room

@@ -8,7 +8,7 @@ import pytest
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg
 from evercal.recordings.frame import Frame, Recording
 from evercal.simulation.box_room import BoxRoom
-from evercal.simulation.fisheye import fisheye_image
+from rooms.fisheye import fisheye_image
 
 FOCAL = 160 / np.deg2rad(75)
 WIDE = Camera(320, 240, FOCAL, FOCAL, 159.5, 119.5, model="fisheye")
