@@ -251,7 +251,9 @@ def _wave(
 
 def _direction(heading: Array | float, pitch: Array | float) -> Array:
     """Viewing directions (..., 3) whose horizontal part is a unit vector."""
-    return np.stack([np.cos(heading), np.sin(heading), pitch], -1)
+    x = np.cos(heading)
+    y = np.sin(heading)
+    return np.stack([x, y, pitch], -1)
 
 
 def look_at(

@@ -67,7 +67,8 @@ def record_cell(
     write_bytes(out / "reachable.csv", pose_rows(reachable).encode())
     rows = []
     for row in nominal_mount().matrix():
-        rows.append(" ".join(f"{x:.9g}" for x in row) + "\n")
+        words = [f"{x:.9g}" for x in row]
+        rows.append(" ".join(words) + "\n")
     write_bytes(out / "rough.txt", "".join(rows).encode())
     truth = {
         "gripper_from_camera": pose_to_dict(cell.truth.gripper_from_camera),

@@ -239,7 +239,8 @@ class VirtualCell:
 
 def nominal_mount() -> SE3:
     """gripper_from_camera as in the drawing of the cell: beside the flange, along the fingers."""
-    turn = SE3.exp([0, 0, 0, 0, 0, np.pi / 4])
+    about_z = np.pi / 4
+    turn = SE3.exp([0, 0, 0, 0, 0, about_z])
     shift = SE3.from_translation((0.05, -0.05, 0.03))
     return shift @ turn
 
