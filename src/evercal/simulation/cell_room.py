@@ -109,7 +109,8 @@ def _thing(seed: int) -> list[Surface]:
     rng = default_rng([seed, 36])
     room = cell_room(seed)
     edges = np.diag(THING_SIZE_M)
-    bottom = (THING_LOW_M + edges[1], edges[0], -edges[1])
+    corner = THING_LOW_M + edges[1]
+    bottom = (corner, edges[0], -edges[1])
     faces = box_faces(THING_LOW_M, edges)
     faces.append(bottom)
     return [Surface(*face, room.texture(rng, calm=False)) for face in faces]

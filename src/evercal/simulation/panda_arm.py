@@ -110,7 +110,8 @@ def joints_for(
     x, y, z = base_from_gripper.translation_m
     raise InputError(
         f"the arm does not reach x {x:.3f}, y {y:.3f}, z {z:.3f} m"
-        f" with this rotation (nearest {1000 * nearest:.0f} mm off); choose a pose nearer to the middle of its workspace"
+        f" with this rotation (nearest {1000 * nearest:.0f} mm off);"
+        " choose a pose nearer to the middle of its workspace"
     )
 
 
