@@ -41,3 +41,42 @@ def test_mistakes_are_refused(tmp_path):
     recorder.add(np.zeros((24, 32, 3), np.uint8), SE3.from_translation((0.3, 0, 0.3)))
     with pytest.raises(InputError, match="other intrinsics"):
         WristRecorder(tmp_path, Camera(32, 24, 40.0, 40.0, 15.5, 11.5))
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("left.jpg", "img_7.jpg"), "0000.jpg"),
+        (("0003.png", "x.jpg"), "0004.jpg"),
+        (("²³.jpg", "1759312345678.jpg", "-5.jpg"), "0000.jpg"),
+        (("0011.jpg", "notes.txt", "0012.xml"), "0013.jpg"),
+    ],
+)
+def test_a_recording_whose_images_are_not_numbered_is_continued(
+    tmp_path, names, expected
+):
+    image = np.full((24, 32, 3), 90, np.uint8)
+    poses = SE3.exp(np.random.default_rng(0).normal(scale=0.5, size=(len(names), 6)))
+    recorder = WristRecorder(tmp_path, CAMERA)
+    for pose in poses:
+        recorder.add(image, pose)
+    table = (tmp_path / "base_from_gripper.csv").read_text()
+    for i, name in enumerate(names):
+        (tmp_path / "images" / f"{i:04d}.jpg").rename(tmp_path / "images" / name)
+        table = table.replace(f"{i:04d}.jpg", name)
+    rows = [row for row in table.splitlines() if not row.startswith(("notes", "0012"))]
+    (tmp_path / "base_from_gripper.csv").write_text("\n".join(rows) + "\n")
+    again = WristRecorder(tmp_path, CAMERA)
+    assert again.add(image, poses[0]).name == expected
+    assert len(load_recording(tmp_path).train) == len(rows)
+
+
+def test_images_that_lie_elsewhere_are_refused(tmp_path):
+    image = np.full((24, 32, 3), 90, np.uint8)
+    WristRecorder(tmp_path / "a", CAMERA).add(image, SE3.identity())
+    (tmp_path / "b").mkdir()
+    for name in ("camera.json", "base_from_gripper.csv"):
+        (tmp_path / "b" / name).write_bytes((tmp_path / "a" / name).read_bytes())
+    (tmp_path / "b" / "images").symlink_to(tmp_path / "a" / "images")
+    with pytest.raises(InputError, match=r"images: is a link; use a new folder"):
+        WristRecorder(tmp_path / "b", CAMERA)

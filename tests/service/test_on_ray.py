@@ -86,6 +86,10 @@ def test_replicas_answer_as_one_process(serve, copy, image, cluster, tmp_path):
             assert time.monotonic() < until
             time.sleep(0.1)
         assert client.localize(image).scene == "lobby"
+    # Serve was started by the command, and ends with it.
+    port = int(ready["url"].rpartition(":")[2])
+    with listening_socket("127.0.0.1", port):
+        pass
 
 
 @pytest.mark.parametrize(

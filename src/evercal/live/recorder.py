@@ -8,7 +8,8 @@ The table is replaced as a whole after every change, so that the folder is a val
 time. A folder that was begun earlier is continued.
 """
 
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -25,6 +26,8 @@ POSES = "base_from_gripper.csv"
 """File name of the gripper poses."""
 JPEG_QUALITY = 95
 """Quality of the images, as of libjpeg."""
+_NUMBER = re.compile("[0-9]{1,9}")
+"""A name that counts; cameras write longer ones, such as times."""
 _COLUMNS = "x,y,z,qw,qx,qy,qz"
 """Columns of a pose: metres, then the quaternion."""
 
@@ -36,6 +39,7 @@ class WristRecorder:
         self._root = Path(root)
         self._camera = camera
         self._frames: list[Frame] = []
+        require_own(self._root / "images")
         if wrist.detect(self._root):
             if not (self._root / POSES).is_file():
                 raise InputError(
@@ -62,10 +66,10 @@ class WristRecorder:
         if not self._frames:
             (self._root / "images").mkdir(parents=True, exist_ok=True)
             write_json(self._root / "camera.json", asdict(self._camera))
-        name = next_name(frame.name for frame in self._frames)
-        path = self._root / "images" / name
+        images = self._root / "images"
+        path = images / next_name(images)
         write_jpeg(path, image, JPEG_QUALITY)
-        frame = Frame(name, path, self._camera, None, base_from_gripper)
+        frame = Frame(path.name, path, self._camera, None, base_from_gripper)
         self._frames.append(frame)
         self._write_poses()
         return frame
@@ -89,11 +93,18 @@ class WristRecorder:
             path.unlink(missing_ok=True)
 
 
-def next_name(names: Iterable[str]) -> str:
+def require_own(folder: Path) -> None:
+    """Refuse a folder that is a link: files that are removed there may be another recording's."""
+    if folder.is_symlink():
+        raise InputError(f"{folder}: is a link; use a new folder")
+
+
+def next_name(folder: Path) -> str:
     """File name of the next image: one more than the largest number among the names."""
     number = 0
-    for name in names:
-        number = max(number, int(Path(name).stem) + 1)
+    for path in folder.iterdir():
+        if _NUMBER.fullmatch(path.stem):
+            number = max(number, int(path.stem) + 1)
     return f"{number:04d}.jpg"
 
 

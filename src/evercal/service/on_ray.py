@@ -57,6 +57,8 @@ def serve_on_ray(
 ) -> None:
     """Serve a map on a cluster until SIGTERM or SIGINT; see `server.serve`.
 
+    If Serve was started here and has no other application, it ends as well.
+
     Args:
         options: Its `host` and `port` are those of the cluster's head.
         address: Of the cluster, see `cluster.connected`.
@@ -80,6 +82,7 @@ def serve_on_ray(
         from ray import serve
 
         logging.getLogger("ray.serve").setLevel(logging.ERROR)
+        ours = not serve.status().proxies
         serve.start(
             http_options={"host": options.host, "port": options.port},
             logging_config={"log_level": "ERROR"},
@@ -102,6 +105,8 @@ def serve_on_ray(
             raise InputError(f"`ray` {address}: {error}") from None
         finally:
             serve.delete(NAME)
+            if ours and not serve.status().applications:
+                serve.shutdown()
 
 
 def _listening_host(ray: Any, host: str) -> str:

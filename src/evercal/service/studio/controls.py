@@ -15,6 +15,7 @@ from evercal.live.coverage import POSITION_MM, ROTATION_DEG
 from evercal.service.studio.devices import Which
 from evercal.service.studio.steps import STEPS
 from evercal.service.studio.studio import FIXED_IMAGES, Studio
+from evercal.service.viewer.gate import chosen
 from evercal.service.viewer.html import (
     calibration_rows,
     chip_html,
@@ -116,7 +117,7 @@ class Controls:
     @property
     def which(self) -> Which:
         """The camera whose picture is shown."""
-        return _CAMERAS[self._camera.value]
+        return _CAMERAS[chosen(self._camera)]
 
     def show(self, next_view: NextViews | None) -> None:
         """Show the state of the steps and of the task that runs."""
@@ -206,7 +207,7 @@ class Controls:
         format = self._gui.add_dropdown("Format", tuple(FORMATS))
         self._button(
             "Export file",
-            lambda: self._studio.export(_CAMERAS[camera.value], format.value),
+            lambda: self._studio.export(_CAMERAS[chosen(camera)], chosen(format)),
         )
 
     def _keep(self, handle: Any, **properties: Callable[[], Any]) -> None:

@@ -15,7 +15,13 @@ from evercal.calibration.from_map.next_views import NextViews, looked_at, next_v
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.live.coverage import IMAGES, SAME_DEG, SAME_MM, Coverage, Sample, coverage
-from evercal.live.recorder import JPEG_QUALITY, POSES, WristRecorder, next_name
+from evercal.live.recorder import (
+    JPEG_QUALITY,
+    POSES,
+    WristRecorder,
+    next_name,
+    require_own,
+)
 from evercal.live.robot import MovingRobot
 from evercal.map import Map
 from evercal.recordings.cameras.camera_file import read_camera
@@ -60,6 +66,7 @@ class Studio:
         self.watched: Callable[[], bool] = lambda: True
         """Whether somebody sees what the arm does; it moves only then."""
         self._refused: list[SE3] = []
+        require_own(out / "fixed")
         self._fixed_camera = out / "fixed_camera.json"
         if devices.fixed_intrinsics is not None:
             write_json(self._fixed_camera, asdict(devices.fixed_intrinsics))
@@ -255,7 +262,7 @@ class Studio:
         image = self.connection.image("fixed")
         folder = self.out / "fixed"
         folder.mkdir(exist_ok=True)
-        name = next_name(path.name for path in self.fixed_images)
+        name = next_name(folder)
         write_jpeg(folder / name, image, JPEG_QUALITY)
         return f"Took image {name}."
 

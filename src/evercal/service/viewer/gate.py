@@ -63,3 +63,10 @@ def gated(key: str, local: bool) -> Iterator[None]:
         raise InputError(
             "this version of viser opens its server otherwise; see constraints.txt"
         )
+
+
+def chosen(dropdown: Any) -> Any:
+    """What a page has chosen of a list; the first where it has sent anything else."""
+    if dropdown.value not in dropdown.options:
+        dropdown.value = dropdown.options[0]
+    return dropdown.value

@@ -23,7 +23,7 @@ from evercal.reports.overlay import resized
 from evercal.reports.scene import THUMBNAIL_PX, ColourBy, Frustum, KeyframeView
 from evercal.service.hosts import is_local, listening_socket, url_of
 from evercal.service.viewer import drawing
-from evercal.service.viewer.gate import gated
+from evercal.service.viewer.gate import chosen, gated
 from evercal.service.viewer.html import (
     GREEN,
     calibration_rows,
@@ -136,8 +136,8 @@ class Page:
             scene = gui.add_dropdown("Scene", tuple(drawn.keyframes))
             colour = gui.add_dropdown("Colour", get_args(ColourBy))
             back = gui.add_button("Back to the overview")
-        scene.on_update(lambda _: drawn.show(scene.value))
-        colour.on_update(lambda _: drawn.colour_by(colour.value))
+        scene.on_update(lambda _: drawn.show(chosen(scene)))
+        colour.on_update(lambda _: drawn.colour_by(chosen(colour)))
         back.on_click(lambda event: event.client and self.look_from_above(event.client))
         for name, calibration in given.items():
             with gui.add_folder(name):
