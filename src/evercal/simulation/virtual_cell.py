@@ -272,8 +272,11 @@ def _tripod(rng: Generator) -> SE3:
     side = 1.0
     if rng.random() >= 0.5:
         side = -1.0
-    position = rng.uniform((-0.1, 0.4, 0.6), (0.2, 0.6, 0.8))
-    aside = rng.uniform(-1, 1, 3) * (0.08, 0.08, 0.02)
+    lowest = (-0.1, 0.4, 0.6)
+    highest = (0.2, 0.6, 0.8)
+    position = rng.uniform(lowest, highest)
+    most_m = (0.08, 0.08, 0.02)
+    aside = rng.uniform(-1, 1, 3) * most_m
     return look_at(
         position * (1.0, side, 1.0),
         WORK_AREA_M + aside,
