@@ -147,7 +147,7 @@ def test_files_that_arrive_after_the_manifest(copy, tmp_path, hall_store, monkey
     shutil.copytree(copy, tmp_path / "new", dirs_exist_ok=True, copy_function=copied)
     assert not live.refresh()
     now = time.monotonic()
-    monkeypatch.setattr(time, "monotonic", lambda: now + 1.1)
+    monkeypatch.setattr(time, "monotonic", lambda: now + 5.1)
     assert live.refresh()
     assert live.fault is None
     assert live.current.scenes == ("hall",)

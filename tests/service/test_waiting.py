@@ -144,7 +144,7 @@ def test_work_that_does_not_end_is_answered_all_the_same(
     assert answers[0].refusal == (503, "the service is being stopped; ask again")
 
 
-@pytest.mark.parametrize("size", [33_000, 100_000, 1_000_000])
+@pytest.mark.parametrize("size", [33_000, 100_000, 200_000])
 @pytest.mark.parametrize("where", ["path", "header"])
 def test_long_headers_are_answered(hall_service, size, where):
     data = b"GET /health HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * size

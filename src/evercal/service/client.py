@@ -2,8 +2,8 @@
 
 import json
 import os
-import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,9 +28,6 @@ Part = tuple[str, bytes]
 """File name and content."""
 Parts = list[tuple[str, Part | str]]
 """Parts of a request by name."""
-
-_ANSWER_S = 0.2
-"""Time to wait for an answer before looking whether there are frames left, seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +96,7 @@ class Client:
     ) -> Iterator[StreamedFrame]:
         """Locate the frames of one camera in order, see `Map.track`.
 
-        A thread sends the frames as they come, while answers are awaited.
+        Each frame is sent when it comes; answers that have arrived until then are returned first.
 
         Args:
             frames: Images; they are sent as those of `localize` are.
@@ -114,16 +111,27 @@ class Client:
 
         url = self._url.replace("http", "ws", 1) + "/track" + "?newest=1" * newest
         try:
-            # The service answers pings after the frames that were sent before.
+            # Pings are answered after the frames that were sent before them.
             with connect(
                 url,
                 additional_headers=self._headers,
                 open_timeout=self._timeout,
                 ping_timeout=None,
+                max_queue=None,
             ) as socket:
                 if camera is not None:
                     socket.send(json.dumps(camera.to_dict()))
-                yield from _answers(socket, _Sending(socket, frames))
+                left = 0
+                for image in frames:
+                    socket.send(_image_part(image, "")[1])
+                    left += 1
+                    with suppress(TimeoutError):
+                        while left:
+                            yield (frame := _streamed(socket.recv(0.0)))
+                            left -= 1 + frame.dropped
+                while left:
+                    yield (frame := _streamed(socket.recv(self._timeout)))
+                    left -= 1 + frame.dropped
         except (OSError, WebSocketException) as error:
             reason = " ".join(str(error).split())
             raise InputError(f"{self._url}: no answer ({reason[:200]})") from None
@@ -185,46 +193,18 @@ class Client:
         raise InputError(message)
 
 
-class _Sending(threading.Thread):
-    """Sends frames until there are no more."""
-
-    def __init__(self, socket: Any, frames: Iterable[np.ndarray | PathLike]):
-        super().__init__(daemon=True)
-        self.sent = 0
-        self.error: Exception | None = None
-        self._socket = socket
-        self._frames = frames
-
-    def run(self) -> None:
-        try:
-            for image in self._frames:
-                self._socket.send(_image_part(image, "")[1])
-                self.sent += 1
-        except Exception as error:
-            self.error = error
-
-
-def _answers(socket: Any, sending: _Sending) -> Iterator[StreamedFrame]:
-    sending.start()
-    answered = 0
-    while sending.is_alive() or answered < sending.sent:
-        try:
-            row = json.loads(socket.recv(_ANSWER_S))
-        except TimeoutError:
-            continue
-        if "error" in row:
-            raise InputError(row["error"])
-        answered = row["frame"] + 1
-        yield StreamedFrame(
-            row["frame"],
-            row["stamp_s"],
-            row["state"],
-            _estimate(row),
-            waiting=row["waiting"],
-            dropped=row["dropped"],
-        )
-    if sending.error is not None:
-        raise sending.error
+def _streamed(answer: str | bytes) -> StreamedFrame:
+    row = json.loads(answer)
+    if "error" in row:
+        raise InputError(row["error"])
+    return StreamedFrame(
+        row["frame"],
+        row["stamp_s"],
+        row["state"],
+        _estimate(row),
+        waiting=row["waiting"],
+        dropped=row["dropped"],
+    )
 
 
 def _image_part(image: np.ndarray | PathLike, name: str) -> Part:

@@ -1,11 +1,9 @@
 """Connections of the service: bounded in number, and in the time until they ask something."""
 
 import asyncio
-import json
 import socket
 from typing import Any
 
-import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
@@ -84,8 +82,6 @@ class _Connection(_Patient, H11Protocol):
 
     latest: asyncio.TimerHandle | None = None
     """Closes the connection unless a request is under way by then."""
-    refused: bool = False
-    """Whether what came was no request."""
 
     @property
     def waits(self) -> bool:
@@ -100,36 +96,6 @@ class _Connection(_Patient, H11Protocol):
         ours = [c for c in self.connections if isinstance(c, _Connection)]
         oldest = min((c for c in ours if c.waits), key=_Connection._deadline)
         oldest.transport.abort()  # at worst this one
-
-    def data_received(self, data: bytes) -> None:
-        if not self.refused:
-            super().data_received(data)
-
-    def send_400_response(self, msg: str) -> None:
-        """Refuse what is no request, and discard the rest for a second.
-
-        A connection that is closed with unread bytes is reset: the answer would be lost.
-        """
-        if not self.waits:
-            return super().send_400_response(msg)
-        self.refused = True
-        status = 400
-        kind = b"text/plain; charset=utf-8"
-        received, _ = self.conn.trailing_data
-        if len(received) > self.bounds.header_bytes:
-            status = 431
-            kind = b"application/json"
-            error = f"headers and path of more than {self.bounds.header_bytes} bytes"
-            msg = json.dumps({"error": error})
-        headers = [(b"content-type", kind), (b"connection", b"close")]
-        for event in (
-            h11.Response(status_code=status, headers=headers),
-            h11.Data(data=msg.encode()),
-            h11.EndOfMessage(),
-        ):
-            self.transport.write(self.conn.send(event))
-        self.transport.write_eof()
-        self.loop.call_later(1.0, self.transport.abort)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._stop_waiting()

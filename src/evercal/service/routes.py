@@ -24,8 +24,11 @@ from evercal.bounds import RequestBounds
 from evercal.calibration import drift
 from evercal.calibration.from_images import calibrate
 from evercal.calibration.image_source import Images
-from evercal.errors import InputError, UnavailableError
+from evercal.errors import InputError
+from evercal.localization.localizer import Localizer
+from evercal.localization.tracking import Tracker
 from evercal.reports.answers import Answer, answer_row, check_record, unit_known
+from evercal.reports.track_files import track_row
 from evercal.robot.mount import MountName
 from evercal.service.desk import Check, Desk
 from evercal.service.guard import Metrics
@@ -37,7 +40,7 @@ from evercal.service.limits import (
     poses_of,
 )
 from evercal.service.live_map import LiveMap
-from evercal.service.stream import Frame, StreamTracker, Waiting, answer_frames
+from evercal.service.stream import Frame, Stream
 
 router = APIRouter()
 CameraFile = Annotated[
@@ -98,12 +101,15 @@ async def index() -> Response:
 @router.get("/health")
 async def health(service: Asked) -> JSONResponse:
     """Whether the service answers, and whether it can read the map."""
-    live = service.live
-    scenes = len(live.current.scenes)
+    scenes = len(service.live.current.scenes)
     status = 200
-    if live.fault is not None and not scenes:
-        status = 503
-    return JSONResponse({"status": live.status, "scenes": scenes}, status)
+    content = {"status": "ok", "scenes": scenes}
+    if service.live.fault is not None:
+        content["status"] = "the map cannot be read; its last state is served"
+        if not scenes:
+            status = 503
+            content["status"] = "the map cannot be read"
+    return JSONResponse(content, status)
 
 
 @router.get("/scenes")
@@ -249,18 +255,31 @@ async def track(socket: WebSocket, service: Asked, newest: bool = False) -> None
     used is answered with `{"error": ...}`. Frames wait in order; with `newest` only the newest
     waits, and the others are dropped.
     """
-    waiting = Waiting(service.limits.stream_bytes, newest)
-    tracker = StreamTracker(lambda: service.live.localizer, service.limits)
+    tracker: Tracker | None = None
+    tracked: tuple[Localizer, bytes] | None = None
+
+    def locate(frame: Frame, name: str) -> dict[str, Any]:
+        nonlocal tracker, tracked
+        localizer = service.live.localizer
+        image = decoded(frame.data, name, service.limits)
+        # The map or the camera changed.
+        if tracker is None or tracked != (localizer, frame.intrinsics):
+            camera = camera_of(frame.intrinsics or None, image.shape[1::-1])
+            tracker = Tracker(localizer, camera)
+            tracked = (localizer, frame.intrinsics)
+        located = tracker.track(image, time.monotonic())
+        known = unit_known(localizer, located.estimate.scene)
+        return track_row(located, name, known)
 
     async def row(frame: Frame) -> dict[str, Any]:
+        name = f"frame {frame.number}"
         try:
-            return await service.desk.run(lambda _: tracker.row(frame))
+            return await service.desk.run(lambda _: locate(frame, name))
         except InputError as error:
-            if isinstance(error, UnavailableError):
-                service.live.distrust()
-            return {"path": frame.name, "error": one_line(error)}
+            service.live.failed(error)
+            return {"path": name, "error": one_line(error)}
 
-    await answer_frames(socket, waiting, row)
+    await Stream(socket, service.limits.stream_bytes, newest).answer(row)
 
 
 def one_line(error: object) -> str:

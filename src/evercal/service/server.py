@@ -111,8 +111,7 @@ async def _poll(live: LiveMap) -> None:
 
 
 def _answer(request: Request, error: Exception) -> JSONResponse:
-    if isinstance(error, UnavailableError):
-        request.app.state.service.live.distrust()
+    request.app.state.service.live.failed(error)
     if isinstance(error, HTTPException):
         return _line(error.detail, error.status_code, error.headers)
     if isinstance(error, RequestValidationError):
@@ -179,7 +178,8 @@ def server_of(app: FastAPI, limits: RequestBounds) -> uvicorn.Server:
         uvicorn.Config(
             app,
             http=requests,
-            h11_max_incomplete_event_size=limits.header_bytes,
+            # The guard refuses headers with an answer, if they end.
+            h11_max_incomplete_event_size=8 * limits.header_bytes,
             ws=streams,
             ws_max_size=limits.frame_bytes,
             ws_per_message_deflate=False,

@@ -2,7 +2,6 @@
 
 import errno
 import json
-import math
 import os
 import resource
 import weakref
@@ -52,14 +51,10 @@ def save_tensors(
 
 def load_tensors(path: Path) -> dict[str, NDArray[np.generic]]:
     """Read the named arrays of a file."""
-    from safetensors import SafetensorError
     from safetensors.numpy import load
 
     with _reading(path):
-        try:
-            return load(path.read_bytes())
-        except SafetensorError as error:
-            raise ValueError(error) from None
+        return load(path.read_bytes())
 
 
 class _OpenFile:
@@ -74,22 +69,21 @@ class _OpenFile:
         self._descriptor = _descriptor(path)
         weakref.finalize(self, os.close, self._descriptor)
         self._opened = self._state()
+        self.bytes, _ = self._opened
 
-    @property
-    def size(self) -> int:
-        """Bytes of the file when it was opened."""
-        return self._opened[0]
-
-    def read(self, start: int, into: NDArray[Any]) -> None:
-        """Fill an array with the bytes from an offset on."""
-        left = into.reshape(-1).view(np.uint8).data
-        while left and (count := os.preadv(self._descriptor, [left], start)):
-            start += count
-            left = left[count:]
+    def read(self, start: int, count: int) -> NDArray[np.uint8]:
+        """Bytes from an offset on."""
+        content = np.empty(count, np.uint8)
+        left = content.data
+        while left and (arrived := os.preadv(self._descriptor, [left], start)):
+            start += arrived
+            left = left[arrived:]
         if left or self._state() != self._opened:
             raise ValueError(
-                "it was overwritten in place while it was open; replace a map by 'mv'"
+                "it is too short, or was overwritten in place while it was open; replace a map by"
+                " 'mv'"
             )
+        return content
 
     def _state(self) -> tuple[int, int]:
         status = os.fstat(self._descriptor)
@@ -99,70 +93,45 @@ class _OpenFile:
 class StoredRows:
     """The rows of an array in an open file: a slice of them is read when it is asked for."""
 
-    def __init__(self, file: _OpenFile, start: int, kind: str, shape: list[int]):
+    def __init__(self, file: _OpenFile, start: int, like: NDArray[Any]):
         self._file = file
         self._start = start
-        self._kind = np.dtype(kind)
-        self._count, *self._shape = shape
+        self._like = like
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._like)
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
-        start, stop, _ = rows.indices(self._count)
-        count = max(stop - start, 0)
-        array = np.empty((count, *self._shape), self._kind)
-        if array.size:
-            row_bytes = array.nbytes // count
-            with _reading(self._file.path):
-                self._file.read(self._start + start * row_bytes, array)
-        return array
+        part = self._like[rows]
+        first, _, _ = rows.indices(len(self))
+        start = self._start + first * self._like[:1].nbytes
+        with _reading(self._file.path):
+            return (
+                self._file.read(start, part.nbytes).view(part.dtype).reshape(part.shape)
+            )
 
 
 def open_tensors(path: Path) -> dict[str, StoredRows]:
     """The named arrays of a file, one or more dimensions each, which stays open."""
     with _reading(path):
         file = _OpenFile(path)
-        entries, begin = _header(file)
+        count = int.from_bytes(file.read(0, _LENGTH), "little")
+        if count > bounds().tensor_header_bytes:
+            raise ValueError(f"its header would have {count} bytes")
+        header = json.loads(file.read(_LENGTH, count).tobytes())
+        header.pop("__metadata__", None)
+        start = _LENGTH + count
         arrays = {}
-        for name, entry in entries.items():
-            if name != "__metadata__":
-                arrays[name] = _stored(file, begin, name, entry)
+        for name, entry in header.items():
+            first, last = entry["data_offsets"]
+            # An array that takes no memory, of this type and shape.
+            like = np.broadcast_to(np.zeros((), _KINDS[entry["dtype"]]), entry["shape"])
+            if not like.ndim or len(range(first, last)) != like.nbytes:
+                raise ValueError(f"{name!r} has not the size of its shape")
+            if first < 0 or start + last > file.bytes:
+                raise ValueError(f"{name!r} does not lie in the file")
+            arrays[name] = StoredRows(file, start + first, like)
         return arrays
-
-
-def _header(file: _OpenFile) -> tuple[dict[str, Any], int]:
-    """What the header says of each array, and the offset behind it."""
-    length = np.zeros(1, "<u8")
-    if file.size < _LENGTH:
-        raise ValueError("it is too short")
-    file.read(0, length)
-    count = int(length[0])
-    if count > min(bounds().tensor_header_bytes, file.size - _LENGTH):
-        raise ValueError(f"its header would have {count} bytes")
-    text = np.zeros(count, np.uint8)
-    file.read(_LENGTH, text)
-    entries = json.loads(text.tobytes())
-    if not isinstance(entries, dict):
-        raise ValueError("its header is no object")
-    return entries, _LENGTH + count
-
-
-def _stored(file: _OpenFile, begin: int, name: str, entry: Any) -> StoredRows:
-    """An array by its entry in the header, whose arrays begin at an offset."""
-    try:
-        kind = _KINDS[entry["dtype"]]
-        shape = list(entry["shape"])
-        first, last = entry["data_offsets"]
-    except (KeyError, TypeError, ValueError):
-        raise ValueError(f"{name!r} in its header is no array") from None
-    numbers = [*shape, first, last]
-    are_sizes = all(type(n) is int and 0 <= n <= file.size for n in numbers)
-    if not shape or not are_sizes or begin + last > file.size:
-        raise ValueError(f"{name!r} does not lie in the file")
-    if math.prod(shape) * np.dtype(kind).itemsize != last - first:
-        raise ValueError(f"{name!r} has not the size of its shape")
-    return StoredRows(file, begin + first, kind, shape)
 
 
 def _descriptor(path: Path) -> int:
@@ -181,7 +150,7 @@ def _descriptor(path: Path) -> int:
 def _reading(path: Path) -> Iterator[None]:
     try:
         yield
-    except (OSError, ValueError, RecursionError) as error:
+    except Exception as error:  # nothing is assumed about a header
         raise UnavailableError(
             f"{path}: not readable ({error}); run 'evercal info --check'"
         ) from None
