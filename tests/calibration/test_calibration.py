@@ -17,7 +17,7 @@ from evercal.calibration.calibration import (
 from evercal.calibration.checks import checks_of
 from evercal.calibration.verdict import TIERS, expected_error, tier, verdict
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry import SE3, Camera, cross_matrix, pose_distance
 
 
 def example() -> Calibration:
@@ -182,6 +182,18 @@ def test_a_verdict_says_what_is_known() -> None:
     for mm, words in ((9.994, "9.99 mm"), (10.0, "10 mm"), (10.6, "11 mm")):
         held = verdict(calibration(2.0, 0.05, held_out_mm=mm, held_out_deg=0.05))
         assert f"; single held-out poses differ by {words} and 0.05 deg" in held
+
+
+def test_a_camera_that_is_known_best_at_the_target_counts_where_it_is() -> None:
+    """Its errors turn it about the target."""
+    target = np.array([0.0, 0.0, 2.0])
+    about = np.concatenate([cross_matrix(target), np.eye(3)])
+    turned = calibration(0.0, 0.0, target_m=2.0)
+    turned = replace(turned, covariance=np.deg2rad(0.1) ** 2 * about @ about.T)
+    assert turned.uncertain_pose.point_sigma_mm(target) == pytest.approx(0, abs=1e-6)
+    # Two axes move the camera by 2 m times 0.1 deg.
+    moved = 2000 * np.deg2rad(0.1) * np.sqrt(2)
+    assert expected_error(turned)[0] == pytest.approx(moved)
 
 
 def test_an_error_of_just_a_bound_is_not_below_it() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evercal.geometry import SE3, UncertainPose, axis_deviation
+from evercal.geometry import SE3, UncertainPose, axis_deviation, in_parent_axes
 
 FIRST = SE3.exp([0.4, -0.3, 1.2, 0.5, -0.8, 0.3])
 SECOND = SE3.exp([-0.2, 0.6, 0.7, -1.1, 0.4, 0.9])
@@ -112,9 +112,18 @@ def test_axis_deviation() -> None:
 
 
 def test_deviations_of_a_pose_are_those_of_its_axes() -> None:
-    pose = UncertainPose(FIRST, np.diag([1e-6, 4e-6, 4e-6, 1e-4, 1e-4, 1e-4]))
+    pose = UncertainPose(FIRST, np.diag([1e-6, 4e-6, 4e-6, 1e-4, 4e-4, 4e-4]))
     assert pose.sigma_mm == pytest.approx(3**0.5)
-    assert pose.sigma_deg == pytest.approx(np.rad2deg(0.01))
+    assert pose.sigma_deg == pytest.approx(np.rad2deg(0.03**0.5 / 10))
+
+
+def test_a_covariance_in_child_axes_is_turned_to_those_of_the_parent() -> None:
+    """Draws of both, with the translation about the axes of the child."""
+    in_child = covariance(15)
+    turned = in_parent_axes(FIRST.rotation_matrix(), in_child)
+    draws = np.random.default_rng(16).multivariate_normal(np.zeros(6), in_child, 40_000)
+    draws[:, :3] = draws[:, :3] @ FIRST.rotation_matrix().T
+    assert_same(turned, draws.T @ draws / len(draws))
 
 
 def test_batches_and_other_shapes_are_refused() -> None:

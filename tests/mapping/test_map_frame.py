@@ -269,6 +269,16 @@ def test_shared_errors_are_those_that_neighbours_leave_correlated() -> None:
     assert radians == pytest.approx(np.sqrt((both[:, 3:] ** 2).mean()))
 
 
+@pytest.mark.parametrize("drifts", [slice(0, 3), slice(3, 6)])
+def test_positions_and_rotations_are_judged_apart(drifts: slice) -> None:
+    rng = np.random.default_rng(8)
+    poses = walk(200, rng)
+    errors = rng.normal(0, 0.004, (200, 6))
+    errors[:, drifts] = 2 * smooth(poses)[:, [0, 1, 5]]
+    metres, radians = shared_sigma(poses, errors, None)
+    assert (metres > 0, radians > 0) == (drifts.start == 0, drifts.start == 3)
+
+
 def test_shared_errors_are_three_standard_errors_from_none() -> None:
     """Independent errors of many draws: about one in a thousand is called shared."""
     rng = np.random.default_rng(7)
