@@ -319,3 +319,34 @@ def test_other_intrinsics_that_are_held_move_the_pose() -> None:
         moved = np.concatenate([shift, turn.as_rotvec()])
         expected = step * slope[:, column]
         assert np.linalg.norm(moved - expected) < 0.05 * np.linalg.norm(expected)
+
+
+def test_independent_errors_average_out() -> None:
+    """An M-estimator's covariance is that of repeated trials where cells share next to nothing."""
+    rng = np.random.default_rng(6)
+    points_m = points(120, 6)
+    drawn = []
+    claimed = []
+    for _ in range(500):
+        noise = 0.5 * rng.normal(size=(120, 2))
+        seen = Observed(project(points_m) + noise, points_m, precise(120, 1.0))
+        found = minimise(seen, CAMERA, matrix_and_position(POSE))
+        result = found.pose(found.covariance(np.zeros(0), np.eye(120)))
+        turned = (POSE.inverse() @ result.pose).log()[3:]
+        shift = result.pose.translation_m - POSE.translation_m
+        drawn.append(np.concatenate([shift, turned]))
+        claimed.append(result.covariance)
+    true = np.cov(np.array(drawn).T)
+    ratio = np.linalg.eigvals(np.linalg.solve(true, np.mean(claimed, 0))).real
+    assert np.exp(np.log(ratio).mean()) == pytest.approx(1, abs=0.1)
+
+
+def test_an_error_that_all_landmarks_share_grows_with_their_number() -> None:
+    """A hundredth of a pixel in every landmark counts as one error of all of them."""
+    for count, sigma_px in ((30, 0.3), (120, 0.1)):
+        points_m = points(count)
+        seen = Observed(project(points_m), points_m, precise(count, sigma_px))
+        found = minimise(seen, CAMERA, matrix_and_position(POSE))
+        assert found.bent == pytest.approx(count * (0.01 / sigma_px) ** 2)
+        prior = found.against(np.array([4.0]))
+        assert prior == pytest.approx((found.variance + found.bent) / 4)

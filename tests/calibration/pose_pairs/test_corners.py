@@ -196,3 +196,38 @@ def test_a_stated_focal_length_is_compared_with_the_corners(
     )
     warnings = solved.checks.to_dict().get("warnings", ())
     assert any("stated focal length" in words for words in warnings) == warned
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_a_rough_lens_leads_to_the_same_calibration(factor: float) -> None:
+    """The intrinsics are fitted until they no longer change."""
+    pairs, corners = corner_pairs(record(BoardSetting(), 4))
+    camera = corners.camera
+    rough = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+    near = solve(pairs, "eye_in_hand", corners=corners)
+    far = solve(pairs, "eye_in_hand", corners=replace(corners, camera=rough))
+    assert near.camera is not None
+    assert far.camera is not None
+    sigma = near.checks.to_dict()["camera_sigma"]["fx"]
+    assert abs(far.camera.fx - near.camera.fx) < 0.3 * sigma
+    assert near.uncertain_pose.squared_mahalanobis(far.parent_from_child) < 0.5
+    assert far.sigma_mm == pytest.approx(near.sigma_mm, rel=0.1)
+
+
+@pytest.mark.parametrize("mount", ["eye_in_hand", "eye_to_hand"])
+def test_corners_of_images_with_wrong_robot_poses_are_left_out(
+    mount: MountName,
+) -> None:
+    drawn = record(BoardSetting(mount, outliers=3), 5)
+    pairs, corners = corner_pairs(drawn)
+    # A repeated image adds nothing.
+    rows = np.r_[np.arange(20), 0]
+    names = (*pairs.names, "again.png")
+    repeated = replace(pairs[rows], names=names)
+    views = replace(corners, views=(*corners.views, corners.views[0]))
+    found = solve(repeated, mount, corners=views)
+    rejected = {i for i, image in enumerate(found.images[:20]) if not image.used}
+    assert rejected == {*drawn.spoiled}
+    assert not found.images[20].used
+    distance = found.uncertain_pose.squared_mahalanobis(drawn.parent_from_camera)
+    assert distance < 16.8

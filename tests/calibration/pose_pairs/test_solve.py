@@ -19,7 +19,11 @@ from evercal.calibration.boards.detection import find_board
 from evercal.calibration.boards.intrinsics import calibrate_camera
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.pose_pairs.pairs import PosePairs
-from evercal.calibration.pose_pairs.solve import BoardCorners, solve
+from evercal.calibration.pose_pairs.solve import (
+    BoardCorners,
+    solve,
+    solve_pose_pairs,
+)
 from evercal.evaluation import share_inside
 from evercal.geometry import SE3, Camera, average_poses, pose_distance
 from evercal.recordings import read_image
@@ -151,6 +155,21 @@ def test_a_slip_is_named_and_widens_the_covariance(what: str, row: int) -> None:
     for pose in (truth.parent_from_camera, after):
         assert calibration.uncertain_pose.squared_mahalanobis(pose) < 16.8
     assert solve(pairs, mount).checks.to_dict()["warnings"] == []
+
+
+def test_lengths_are_stated_in_metres_unless_said_otherwise() -> None:
+    """A board that is stated can be off by 0.2 %, and so can its depth in all images."""
+    pairs = recording(Setting(), 4).pairs
+    default = solve_pose_pairs(pairs, "eye_in_hand")
+    stated = solve(pairs, "eye_in_hand", scale_known=True)
+    np.testing.assert_array_equal(default.calibration().covariance, stated.covariance)
+    for scale_known, of_board, names in (
+        (True, True, {"shared depth", "size"}),
+        (False, True, {"size"}),
+        (True, False, {"size"}),
+    ):
+        found = solve_pose_pairs(pairs, "eye_in_hand", scale_known, of_board=of_board)
+        assert {*found.equation.extras.names} == names
 
 
 REAL = Path(os.environ.get("EVERCAL_REAL_DATA", "")) / "handeye"
