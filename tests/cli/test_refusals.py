@@ -227,12 +227,16 @@ def test_bad_input_is_one_line_and_writes_nothing(run, folder, paths, snapshot, 
     assert after == stores
 
 
+BOARD = "detect --board chessboard --size 9x6 --square-mm 25"
+
+
 @pytest.mark.usefixtures("folder")
 @pytest.mark.parametrize(
     ("words", "package", "extra"),
     [
         ("serve MAP", "evercal.service.server", "serve"),
         ("view MAP", "viser", "view"),
+        (f"{BOARD} --make-board b.pdf", "PIL.Image", "boards"),
         ("studio --virtual --out s", "viser", "view"),
     ],
 )
@@ -255,6 +259,5 @@ def test_limits_hold_for_files_and_for_opencv(tmp_path):
         ends.append(
             subprocess.run(words, capture_output=True, text=True, env=clean).stderr
         )
-    assert "a.png: not a readable image" in ends[0]
-    assert "of at most 1,999 pixels" in ends[0]
-    assert "not a readable image" not in ends[1]
+    assert "a.png (50x40): 2,000 pixels, at most 1,999 are read" in ends[0]
+    assert "a.png (" not in ends[1]
