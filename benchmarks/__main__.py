@@ -46,6 +46,7 @@ VERBS = {
     "speed": ("speed", "time of learning, localization and SARS"),
     "tracking": ("tracking", "streams: wrong poses, ellipsoids, CPU time of a frame"),
     "serve": ("serve", "latency of the HTTP service"),
+    "serve-streams": ("serve_streams", "streams to the HTTP service: losses, delays"),
     "retrieval": (
         "retrieval",
         "the right scene among 100,000 keyframes, milliseconds and bytes",

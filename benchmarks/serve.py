@@ -18,11 +18,11 @@ import numpy as np
 import urllib3
 from tyro.conf import OmitArgPrefixes
 
-from benchmarks.malformed import heavy, malformed
 from benchmarks.rows import Row, save
 from evercal import InputError, Map, Recording, load_recording
 from evercal.processes import cores, python_command
 from evercal.recordings.images import decode_image, encode_jpeg
+from tests.service.malformed import heavy, malformed
 
 _WARM = 10
 """Requests before the first one that counts."""
@@ -73,7 +73,7 @@ def run(
             print(row, flush=True)
         save(out, rows, {"clients": load.clients})
 
-    with _served(store) as service:
+    with served(store) as service:
         keep(*_pairs(opened, service, images, load.requests))
         keep(*_mixed(opened, service, images, load))
         keep(_bad(service, load.bad))
@@ -82,7 +82,7 @@ def run(
 
 
 @dataclass
-class _Service:
+class Service:
     """A service in a process of its own."""
 
     process: subprocess.Popen[str]
@@ -102,6 +102,7 @@ class _Service:
         return self._memory("VmHWM")
 
     def forget_peak(self) -> None:
+        """Measure the peak from now on."""
         Path(f"/proc/{self.process.pid}/clear_refs").write_text("5")
 
     def _memory(self, name: str) -> float:
@@ -131,14 +132,15 @@ class _Service:
 
 
 @contextmanager
-def _served(store: Path) -> Iterator[_Service]:
+def served(store: Path) -> Iterator[Service]:
+    """Serve a map meanwhile."""
     command = python_command(
         "-m", "evercal", "serve", str(store), "--port", "0", "--json"
     )
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
-            yield _Service(process, json.loads(process.stdout.readline())["url"])
+            yield Service(process, json.loads(process.stdout.readline())["url"])
         finally:
             process.terminate()
 
@@ -159,7 +161,7 @@ def _decoded(data: bytes) -> np.ndarray:
 
 
 def _pairs(
-    opened: Map, service: _Service, images: list[bytes], requests: int
+    opened: Map, service: Service, images: list[bytes], requests: int
 ) -> list[Row]:
     def direct(number: int) -> None:
         opened.localize(_decoded(images[number % len(images)]))
@@ -178,7 +180,7 @@ def _pairs(
 
 
 def _mixed(
-    opened: Map, service: _Service, images: list[bytes], load: Load
+    opened: Map, service: Service, images: list[bytes], load: Load
 ) -> Iterator[Row]:
     """Throughput of located images, beside direct calls in as many threads as the service has."""
     threads = cores()
@@ -216,7 +218,7 @@ def _mixed(
         }
 
 
-def _bad(service: _Service, count: int) -> Row:
+def _bad(service: Service, count: int) -> Row:
     """Malformed requests one after the other, and /health at the same time."""
     idle = service.resident_mb
     statuses = Counter[str]()
@@ -252,7 +254,7 @@ def _bad(service: _Service, count: int) -> Row:
     }
 
 
-def _memory(service: _Service, images: list[bytes], load: Load) -> Row:
+def _memory(service: Service, images: list[bytes], load: Load) -> Row:
     def ask(number: int) -> float:
         return _ms(lambda i: service.localize(images[i % len(images)]), number)
 
@@ -269,7 +271,7 @@ def _memory(service: _Service, images: list[bytes], load: Load) -> Row:
     }
 
 
-def _end(service: _Service, images: list[bytes], clients: int) -> Row:
+def _end(service: Service, images: list[bytes], clients: int) -> Row:
     """SIGTERM while all clients wait: statuses of their requests."""
     statuses = []
     asking = [
