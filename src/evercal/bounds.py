@@ -38,6 +38,8 @@ class Bounds:
     """Text file."""
     nodes: int = 20_000
     """Values in a YAML file."""
+    elements: int = 200_000
+    """Links and joints of a URDF, and elements in them."""
     numbers: int = 10_000_000
     """Numbers of an array, and cells of a table."""
     pixels: int = 100_000_000

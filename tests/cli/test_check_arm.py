@@ -13,7 +13,6 @@ from evercal.simulation.cell_room import WORK_AREA_M, cell_room
 pytestmark = pytest.mark.slow(
     "src/evercal/calibration", "src/evercal/mapping", "src/evercal/recordings/poses"
 )
-pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
 
 CAMERA = Camera(320, 240, 320, 320, 159.5, 119.5)
 HOME = np.array([0, -0.2, 0.3, 0, 1.2, 0])

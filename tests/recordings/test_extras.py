@@ -9,7 +9,6 @@ import pytest
 from evercal.recordings.formats import colmap, lerobot
 from evercal.recordings.formats.bags.file import BagFile
 from evercal.recordings.formats.video_file import Videos
-from evercal.robot.robot_model import RobotModel
 
 from .checks import refused
 
@@ -19,7 +18,6 @@ from .checks import refused
     [
         ("pycolmap", "colmap", colmap._model),
         ("rosbags.highlevel", "bags", BagFile),
-        ("yourdfpy", "urdf", RobotModel),
         ("pyarrow.parquet", "lerobot", lambda path: lerobot._columns(path, [])),
         ("av", "lerobot", lambda _: Videos(30.0)),
     ],

@@ -1,5 +1,6 @@
 """Chains of joints: closed forms, slopes by finite differences, URDFs that are refused."""
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,6 @@ from evercal.robot.arm import Arm
 from evercal.robot.robot_model import RobotModel
 
 from ..recordings.checks import refused
-
-pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
 
 ALONG = '<origin xyz="0.4 0.1 0.2" rpy="0.3 -0.2 0.5"/>'
 
@@ -252,6 +251,104 @@ def test_urdfs_without_one_meaning_are_refused(
     tmp_path: Path, parts: tuple[str, ...], message: str
 ) -> None:
     refused(message, robot, tmp_path, *parts)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        # What a recovering reader leaves out: the arm would lose an offset.
+        (('xyz="0.4 0.1 0.2"', "xyz=0.4 0.1 0.2"), "no usable URDF: it is no XML: not well"),
+        (('rpy="0.3', '& rpy="0.3'), "it is no XML: not well-formed .* line 1, column"),
+        (('<joint name="j"', '<!DOCTYPE r><joint name="j"'), "it is no XML"),
+        (("<robot", "<!DOCTYPE robot><robot"), "it has a DOCTYPE, which no URDF needs"),
+        (("<robot", "<sdf><robot"), "it begins with <sdf>, not with <robot>"),
+        (("</robot>", "</robot><robot/>"), "it is no XML: junk after document element"),
+        (('type="revolute"', 'Type="revolute"'), "joint j: its type is missing"),
+        (("<parent ", "<parnt "), "joint j: its parent link is missing"),
+        (('<child link="b"', '<child lnk="b"'), "joint j: its child link is missing"),
+        (('<link name="a"/>', "<link/>"), "URDF: link None: its name is missing"),
+        (('lower="-3"', 'lower="left"'), "joint j: 'left' is no finite number"),
+    ],
+)  # fmt: skip
+def test_what_is_no_urdf_is_refused_in_one_line(
+    tmp_path: Path, change: tuple[str, str], message: str
+) -> None:
+    file = robot(tmp_path, joint("j", "ab")).path
+    text = file.read_text()
+    assert change[0] in text
+    file.write_text(text.replace(*change, 1))
+    refused(message, RobotModel, file)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("<origin", "<orgin"), "joint j has 'orgin ...'; did you mean 'origin ...'?"),
+        (
+            ("<origin", "<Origin"),
+            "joint j has 'Origin ...'; did you mean 'origin ...'?",
+        ),
+        (
+            (' xyz="0.4', ' XYZ="0.4'),
+            "joint j has 'origin XYZ'; did you mean 'origin xyz'?",
+        ),
+        (("rpy=", "ryp="), "joint j has 'origin ryp'; did you mean 'origin rpy'?"),
+        (("<axis", "<axes"), "joint j has 'axes xyz'; did you mean 'axis xyz'?"),
+        (
+            ('<axis xyz="0', '<axis xzy="0'),
+            "joint j has 'axis xzy'; did you mean 'axis xyz'?",
+        ),
+        (("<limit", "<limits"), "joint j has 'limits .*; did you mean 'limit .*?"),
+        (("upper=", "uper="), "joint j has 'limit uper'; did you mean 'limit upper'?"),
+        (("<mimic", "<mimick"), "joint m has 'mimick .*; did you mean 'mimic .*?"),
+        (
+            ("multiplier", "multiplyer"),
+            "joint m has 'mimic multiplyer'; did you mean 'mimic multi",
+        ),
+    ],
+)
+def test_misspelt_parts_of_a_joint_are_named_where_it_is_used(
+    tmp_path: Path, change: tuple[str, str], message: str
+) -> None:
+    mimic = '<mimic joint="j" multiplier="2" offset="0"/>'
+    parts = [joint("j", "ab"), joint("m", "bc", mimic), joint("k", "cd")]
+    parts[:2] = [part.replace(*change) for part in parts[:2]]
+    model = robot(tmp_path, *parts)
+    refused(message.replace("?", r"\?"), model.arm, "a", "c")
+    assert model.arm("c", "d").joints == ("k",)
+
+
+def test_what_other_programs_add_to_a_urdf_is_skipped(tmp_path: Path) -> None:
+    more = '<controller_gains Kp="1"/><drake:origin/><joint_properties damping="1"/>'
+    part = joint("j", "ab", more).replace("<limit", '<limit drake:lower="1" power="2"')
+    part = part.replace("<joint ", '<joint dont_collapse="true" ')
+    file = robot(tmp_path, part.replace("<axis", '<axis rpy="0 0 0"')).path
+    beside = '<RefLink/><loop_joint/><sensor:camera/><gazebo><joint name="j"/></gazebo>'
+    text = file.read_text().replace("</robot>", f"{beside}</robot>")
+    file.write_text(f'\n<?xml version="1.0"?>{text}')
+    assert RobotModel(file).arm("a", "b").joints == ("j",)
+
+
+def test_a_chain_of_many_links_takes_time_in_proportion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def chain(length: int) -> float:
+        links = [f'<link name="{i}"/>' for i in range(length + 1)]
+        ends = '<parent link="{}"/><child link="{}"/>'
+        for i in range(length):
+            inside = ends.format(i, i + 1)
+            links.append(f'<joint name="{i}" type="revolute">{inside}</joint>')
+        file = tmp_path / "long.urdf"
+        file.write_text(f'<robot name="r">{"".join(links)}</robot>')
+        start = time.process_time()
+        arm = RobotModel(file).arm("0", str(length))
+        assert len(arm.joints) == length
+        return time.process_time() - start
+
+    chain(100)
+    assert chain(8_000) < 20 * chain(1_000)
+    monkeypatch.setenv("EVERCAL_LIMITS", "elements=100")
+    refused("links, joints and elements in them, at most 100", chain, 1_000)
 
 
 def test_a_urdf_that_was_cut_off_is_refused(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal
@@ -107,6 +108,13 @@ def test_a_bad_file_is_named(localizer, tmp_path):
         Page(localizer, (bent,))
     with page_of(localizer) as page, pytest.raises(InputError, match="no such folder"):
         page.track(str(gone))
+
+
+def test_drawing_an_arm_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "yourdfpy", None)
+    (tmp_path / "arm.urdf").write_text(ARM)
+    with pytest.raises(InputError, match=r"constraints.txt '\.\[urdf\]'"):
+        add_arm(None, tmp_path / "arm.urdf", None, [])
 
 
 def test_the_gripper_follows_the_joints(tmp_path):

@@ -1,15 +1,17 @@
-"""`RobotModel`: an arm from its URDF, which yourdfpy reads (extra `urdf`)."""
+"""`RobotModel`: an arm from its URDF."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from evercal.errors import InputError, optional_module
+from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.robot.arm import Arm, MovingJoint
-from evercal.storage.text_files import library_errors, read_text, refuse_repeated
+from evercal.robot.urdf import Joint, read_urdf
+from evercal.storage.text_files import named_errors, naming, refuse_repeated
 from evercal.typing import Array, PathLike
 
 _MOVING = ("revolute", "continuous", "prismatic")
@@ -34,33 +36,16 @@ class RobotModel:
 
     def __init__(self, path: PathLike) -> None:
         self.path = Path(path)
-        need = f"{path}: reading a URDF needs yourdfpy"
-        yourdfpy = optional_module("yourdfpy", need, "urdf")
-        etree = optional_module("lxml.etree", need, "urdf")
         if not self.path.is_file():
             raise InputError(f"{path}: no such URDF file")
         if self.path.suffix == ".xacro":
             raise InputError(
                 f"{path}: is a macro file; make a URDF of it with 'xacro' first"
             )
-        with library_errors(f"{path}: no usable URDF"):
-            if "</robot" not in read_text(self.path, "URDF"):
-                # Else the elements before a cut would be read as the whole.
-                raise ValueError("it does not end with </robot>, so a part is missing")
-            urdf = yourdfpy.URDF.load(
-                str(path),
-                load_meshes=False,
-                load_collision_meshes=False,
-                build_scene_graph=False,  # it fails where a part of no interest is wrong
-            )
-            self._joints = urdf.robot.joints
-            self._joint_named = urdf.joint_map
-            self.links = tuple(link.name for link in urdf.robot.links)
+        self.links, self._joints = read_urdf(self.path)
+        self._joint_named = {joint.name: joint for joint in self._joints}
+        with named_errors(self.path, "URDF"), naming("no usable URDF"):
             self._index_links()
-            tree = etree.parse(str(path), etree.XMLParser(recover=True))
-            _check_origins(tree)
-            # Of the readers pinocchio alone heeds quat_xyzw, and yourdfpy does not keep it.
-            self._turned = set(tree.xpath("/robot/joint[origin/@quat_xyzw]/@name"))
 
     def _index_links(self) -> None:
         unique = "give each link and each joint its own name"
@@ -141,14 +126,12 @@ class RobotModel:
             raise InputError(
                 f"{self.path}: no joints connect {base} and {gripper}; name others"
             )
-        steps = []
-        for joint in up:
-            if joint not in down:
-                steps.append((joint, True))
+        common = {*up} & {*down}
+        steps = [(joint, True) for joint in up if joint not in common]
         for joint in reversed(down):
-            if joint not in up:
+            if joint not in common:
                 steps.append((joint, False))
-        names: list[str] = []
+        names: dict[str, int] = {}
         chain: list[MovingJoint] = []
         before = np.eye(4)
         for joint, backwards in steps:
@@ -159,13 +142,11 @@ class RobotModel:
                 before = before @ origin
             if joint.type in _MOVING:
                 name, factor, constant = self._driver(joint)
-                if name not in names:
-                    names.append(name)
+                value = names.setdefault(name, len(names))
                 axis = self._axis(joint)
                 if backwards:
                     axis = -axis
                 rotates = joint.type != "prismatic"
-                value = names.index(name)
                 moving = MovingJoint(before, axis, rotates, value, factor, constant)
                 chain.append(moving)
                 before = np.eye(4)
@@ -194,37 +175,40 @@ class RobotModel:
             origins[joint.name] = (moved, rotates)
         return origins
 
-    def _origin(self, joint: Any) -> Array:
+    def _origin(self, joint: Joint) -> Array:
         """(4, 4) parent_from_joint at the value zero."""
-        if joint.name in self._turned:
-            problem = "is turned by quat_xyzw, which most programs ignore; write rpy"
+        if problem := joint.problem():
             raise self._error(joint, problem)
-        if joint.origin is None:
-            return np.eye(4)
-        return joint.origin
+        origin = np.eye(4)
+        turn = Rotation.from_euler("xyz", joint.numbers["origin rpy"])
+        origin[:3, :3] = turn.as_matrix()
+        origin[:3, 3] = joint.numbers["origin xyz"]
+        return origin
 
-    def _axis(self, joint: Any) -> Array:
+    def _axis(self, joint: Joint) -> Array:
         """(3,) unit vector."""
-        length = np.linalg.norm(joint.axis)
+        axis = np.array(joint.numbers["axis xyz"])
+        length = np.linalg.norm(axis)
         if not 0 < length < np.inf:
-            raise self._error(joint, f"has the axis {joint.axis}")
-        return joint.axis / length
+            raise self._error(joint, f"has the axis {axis}")
+        return axis / length
 
-    def _driver(self, joint: Any) -> tuple[str, float, float]:
+    def _driver(self, joint: Joint) -> tuple[str, float, float]:
         """Name of the value that moves a joint, and factor and constant of its motion."""
         factor = 1.0
         constant = 0.0
         followers = [joint.name]
-        while joint.mimic is not None:
-            constant += factor * joint.mimic.offset
-            factor *= joint.mimic.multiplier
-            name = joint.mimic.joint
-            driver = self._joint_named.get(name)
-            problem = ""
+        while "mimic" in joint.element.starts:
+            constant += factor * joint.numbers["mimic offset"][0]
+            factor *= joint.numbers["mimic multiplier"][0]
+            name = joint.element.stated.get("mimic joint", "")
+            driver = self._joint_named.get(name, joint)
             if name in followers:
                 problem = "mimics it"
-            elif driver is None or driver.type not in _MOVING:
+            elif driver is joint or driver.type not in _MOVING:
                 problem = "is no moving joint of it"
+            else:
+                problem = driver.problem()
             if problem:
                 raise self._error(
                     joint, f"mimics {name}, which {problem}; correct the URDF"
@@ -253,10 +237,8 @@ class RobotModel:
             if np.ptp(column) > _LARGEST_RAD:
                 return [f"{covered}, more than two rotations; are these degrees?"]
             return []
-        lower = getattr(joint.limit, "lower", None)
-        upper = getattr(joint.limit, "upper", None)
-        if lower is None or upper is None:
-            return []
+        (lower,) = joint.numbers["limit lower"]
+        (upper,) = joint.numbers["limit upper"]
         if least >= lower - 0.1 and most <= upper + 0.1:
             return []
         return [
@@ -264,7 +246,7 @@ class RobotModel:
             f" right order and in radians?"
         ]
 
-    def _joints_above(self, link: str) -> tuple[list[Any], str]:
+    def _joints_above(self, link: str) -> tuple[list[Joint], str]:
         """Joints from a link up to its root, and the root."""
         if link not in self.links:
             raise InputError(
@@ -280,13 +262,5 @@ class RobotModel:
                 )
         return joints, link
 
-    def _error(self, joint: Any, problem: str) -> InputError:
+    def _error(self, joint: Joint, problem: str) -> InputError:
         return InputError(f"{self.path}: joint {joint.name} {problem}")
-
-
-def _check_origins(tree: Any) -> None:
-    """Refuse positions and angles in the XML of a URDF that are not three finite numbers."""
-    for text in tree.xpath("/robot/joint/*/@xyz | /robot/joint/*/@rpy"):
-        numbers = [*map(float, text.split())]
-        if np.isfinite(numbers).sum() != 3:
-            raise ValueError(f"'{text}' are not three finite numbers")

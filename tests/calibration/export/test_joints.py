@@ -1,4 +1,4 @@
-"""Offsets of joints: in a URDF that yourdfpy reads, in JSON, in LeRobot's calibration file."""
+"""Offsets of joints: in a URDF, in JSON, in LeRobot's calibration file."""
 
 import json
 import re
@@ -16,8 +16,6 @@ from evercal.geometry import SE3, pose_distance
 from evercal.robot.robot_model import RobotModel
 
 from .random_poses import calibration_of
-
-pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
 
 URDF = """<?xml version="1.0"?>
 <robot name="arm">
@@ -123,6 +121,40 @@ def test_the_rest_of_the_urdf_stays(tmp_path: Path) -> None:
     assert [was.strip()[:13] for was, _ in differ] == [
         "<origin rpy =", "<origin xyz=\"", "<joint name=\"", "<origin xyz=\""
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be"])
+def test_a_urdf_of_two_bytes_a_letter_is_refused(tmp_path: Path, encoding: str) -> None:
+    text = URDF.replace('"1.0"?>', '"1.0" encoding="utf-16"?>')
+    file = file_of(tmp_path, text, encoding)
+    assert RobotModel(file).arm("base", "tip").joints[1] == "elbow"
+    with pytest.raises(InputError, match=r"arm.urdf: its text is not UTF-8; save it so"):
+        ARM.export("corrected_urdf", tmp_path / "new.urdf", urdf=file)
+    assert not (tmp_path / "new.urdf").exists()
+
+
+@pytest.mark.parametrize(
+    ("removed", "message"),
+    [
+        (rb"nothing", "is no XML: duplicate attribute"),
+        (rb" (xyz|rpy) ?=[^/>]*", "origins cannot be replaced"),
+    ],
+)
+def test_a_urdf_that_was_written_wrong_is_not_kept(
+    tmp_path: Path, removed: bytes, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The replaced attribute stays, or the other one is lost as well."""
+    replaced = re.sub
+
+    def wrong(pattern: bytes, new: bytes, tag: bytes) -> bytes:
+        return replaced(removed, new, tag)
+
+    monkeypatch.setattr("evercal.calibration.export.joints.re.sub", wrong)
+    still = with_joints(JOINTS[1])
+    file = file_of(tmp_path, URDF)
+    with pytest.raises(InputError, match=rf"arm.urdf: .*{message}"):
+        still.export("corrected_urdf", tmp_path / "new.urdf", urdf=file)
+    assert not (tmp_path / "new.urdf").exists()
 
 
 def test_offsets_of_zero_leave_the_poses(tmp_path: Path) -> None:

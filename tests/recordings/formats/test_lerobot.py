@@ -194,7 +194,6 @@ def test_datasets_are_read(version: str, kind: str, codec: str, tmp_path: Path) 
 
 
 def test_joints_and_a_urdf_in_radians_or_degrees(tmp_path: Path) -> None:
-    pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
     root = make(tmp_path / "wave", "v2.1", "image")
     urdf = root / "arm.urdf"
     urdf.write_text(URDF)

@@ -16,8 +16,6 @@ from evercal.robot.robot_model import RobotModel
 
 from ..checks import assert_pose, refused
 
-pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
-
 # Two links of 0.5 and 0.3 m in the plane, on a column of 0.2 m; a slide at the end moves along x.
 PLANAR = """<robot name="planar">
   <link name="base"/><link name="upper"/><link name="lower"/><link name="slide"/><link name="tip"/>

@@ -4,14 +4,14 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from xml.parsers import expat
 
 from evercal.calibration.export.request import Export, pose_numbers
 from evercal.calibration.framed_pose import JointOffset
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.robot.robot_model import RobotModel
-from evercal.storage.text_files import library_errors, read_json
+from evercal.robot.urdf import parsed_urdf
+from evercal.storage.text_files import named_errors, read_json
 
 _LEROBOT_TICKS = 4095 / 360
 """A degree of LeRobot is this many ticks: it divides by the resolution minus 1."""
@@ -64,45 +64,42 @@ def corrected_urdf(export: Export) -> bytes:
                 f"{file}: has no {kind} joint {joint.name} with a value of its own; give the arm's"
                 f" URDF"
             )
-    with library_errors(f"{file}: no usable URDF"):
-        return _with_origins(Path(file).read_bytes(), model.origins_with(offsets))
+    with named_errors(model.path, "URDF"):
+        return _with_origins(model.path.read_bytes(), model.origins_with(offsets))
 
 
 def _with_origins(urdf: bytes, moved: Mapping[str, tuple[SE3, bool]]) -> bytes:
-    """State the rotations of the origins of joints that rotate, the positions of others."""
-    path: list[tuple[str, str]] = []
-    places: dict[tuple[str, str], int] = {}
+    """State the rotations of the origins of joints that rotate, the positions of others.
 
-    def begin(tag: str, attributes: dict[str, str]) -> None:
-        path.append((tag, attributes.get("name", "")))
-        inside_robot = [tag for tag, _ in path[1:]]
-        if inside_robot in (["joint"], ["joint", "origin"]):
-            joint = path[1][1]
-            places.setdefault((joint, tag), parser.CurrentByteIndex)
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler = begin
-    parser.EndElementHandler = lambda _: path.pop()
-    parser.Parse(urdf, True)
+    The result is read again, and its numbers are compared with the wanted ones.
+    """
+    joints = {joint.name: joint for joint in parsed_urdf(urdf).joints}
+    wanted = {name: joint.numbers for name, joint in joints.items()}
     # The last first, so that places before it stay.
-    for name in sorted(moved, key=lambda name: -places[name, "joint"]):
+    for name in sorted(moved, key=lambda name: -joints[name].element.starts["joint"]):
         origin, rotates = moved[name]
         numbers = pose_numbers(origin, "rpy").tolist()
-        key = b"xyz"
+        key = "xyz"
         values = numbers[:3]
         if rotates:
-            key = b"rpy"
+            key = "rpy"
             values = numbers[3:]
-        attribute = b'<origin %s="%s"' % (key, " ".join(map(repr, values)).encode())
-        has_origin = (name, "origin") in places
-        start = places.get((name, "origin"), places[name, "joint"])
-        end = next(_TAG.finditer(urdf, start)).end()
-        tag = urdf[start:end]
-        tag = re.sub(rb"\s%s\s*=\s*(\"[^\"]*\"|'[^']*')" % key, b"", tag)
-        if not has_origin:
+        wanted[name] = {**wanted[name], f"origin {key}": values}
+        attribute = f'<origin {key}="{" ".join(map(repr, values))}"'.encode()
+        starts = joints[name].element.starts
+        start = starts.get("origin", starts["joint"])
+        match = _TAG.match(urdf, start)
+        if match is None or b"\0" in match[0]:
+            raise ValueError("its text is not UTF-8; save it so")
+        pattern = rb"\s%s\s*=\s*(\"[^\"]*\"|'[^']*')" % key.encode()
+        tag = re.sub(pattern, b"", match[0])
+        if "origin" not in starts:
             tag += b"<origin/>"
         tag = tag.replace(b"<origin", attribute, 1)
-        urdf = urdf[:start] + tag + urdf[end:]
+        urdf = urdf[:start] + tag + urdf[match.end() :]
+    written = {joint.name: joint.numbers for joint in parsed_urdf(urdf).joints}
+    if written != wanted:
+        raise ValueError("its origins cannot be replaced; write them in a simpler way")
     return urdf
 
 

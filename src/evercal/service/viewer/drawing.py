@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from evercal.calibration.calibration import Calibration
-from evercal.errors import InputError
+from evercal.errors import InputError, optional_module
 from evercal.geometry import SE3, Camera
 from evercal.mapping.scene_map import SceneMap
 from evercal.reports.overlay import resized
@@ -203,6 +203,7 @@ def add_arm(
     The node `gripper` moves with the first of `links` that the arm has.
     """
     model = RobotModel(path)  # reports what is wrong in the file
+    optional_module("yourdfpy", f"{path}: drawing an arm needs yourdfpy", "urdf")
     from viser.extras import ViserUrdf
 
     link = next((link for link in links if link in model.links), None)

@@ -35,7 +35,6 @@ TURNING = (
 @pytest.fixture
 def urdf(tmp_path: Path) -> Path:
     """A link that turns by one joint."""
-    pytest.importorskip("yourdfpy", reason="the extra 'urdf' is not installed")
     (tmp_path / "arm.urdf").write_text(TURNING)
     return tmp_path / "arm.urdf"
 

@@ -1,0 +1,159 @@
+"""`read_urdf`: links and joints of a URDF, by one strict reading of its XML."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import NamedTuple
+from xml.parsers import expat
+
+from evercal.bounds import require_at_most
+from evercal.storage.text_files import named_errors, naming
+
+_ENDS = ("name", "type", "parent link", "child link")
+_DEFAULTS = {
+    "origin xyz": "0 0 0",
+    "origin rpy": "0 0 0",
+    "axis xyz": "1 0 0",
+    "mimic multiplier": "1",
+    "mimic offset": "0",
+    "limit lower": "-inf",
+    "limit upper": "inf",
+}
+"""Numbers of a joint, and what they are if they are omitted."""
+_KNOWN = {*_ENDS, *_DEFAULTS, "mimic joint"}
+_LIKENESS = 0.8
+"""Ratio of difflib from which a name is a misspelt one."""
+
+
+class Element(NamedTuple):
+    """A link or a joint as the file states it."""
+
+    tag: str
+    stated: dict[str, str]
+    """Its attributes, and those of elements in it by two names, such as `axis xyz`."""
+    starts: dict[str, int]
+    """Bytes of the file at which it and the elements in it begin; the first of each name counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint."""
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    numbers: Mapping[str, list[float]]
+    """By element and attribute, such as `axis xyz`."""
+    element: Element
+
+    def problem(self) -> str:
+        """What makes its pose doubtful; empty if nothing does."""
+        stated = self.element.stated
+        if "origin quat_xyzw" in stated:
+            # Of the readers, pinocchio alone heeds it.
+            return "is turned by quat_xyzw, which most programs ignore; write rpy"
+        missing = _KNOWN - stated.keys()
+        if self.type == "fixed":
+            missing &= {"origin xyz", "origin rpy"}
+        for name in sorted(stated.keys() - _KNOWN):
+            for like in get_close_matches(name.lower(), sorted(missing), 1, _LIKENESS):
+                if ":" not in name:
+                    return f"has '{name}'; did you mean '{like}'?"
+        return ""
+
+
+class Urdf(NamedTuple):
+    """Names of links, and joints, in the order of the file."""
+
+    links: tuple[str, ...]
+    joints: tuple[Joint, ...]
+
+
+def read_urdf(path: Path) -> Urdf:
+    """Read the links and joints of a file; all else is skipped.
+
+    Raises:
+        InputError: It is no XML, or one of them is incomplete.
+    """
+    with named_errors(path, "URDF"), naming("no usable URDF"):
+        require_at_most(path.stat().st_size, "text_bytes", "bytes")
+        return parsed_urdf(path.read_bytes())
+
+
+def parsed_urdf(data: bytes) -> Urdf:
+    """Parse links and joints; ValueError as for `read_urdf`."""
+    links = []
+    joints = []
+    for element in _elements(data):
+        with naming(f"{element.tag} {element.stated.get('name')}"):
+            if element.tag == "joint":
+                joints.append(_joint(element))
+            else:
+                links += _required(element, "name")
+    if not links:
+        raise ValueError("it has no links; make a URDF of a macro file with xacro")
+    return Urdf(tuple(links), tuple(joints))
+
+
+def _elements(data: bytes) -> list[Element]:
+    """Links and joints of the robot. As in ROS, prefixes of names need no declaration."""
+    blank = len(data) - len(data.lstrip())
+    above: list[str] = []
+    elements: list[Element] = []
+    count = 0
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal count
+        start = parser.CurrentByteIndex + blank
+        if not above and tag != "robot":
+            raise ValueError(f"it begins with <{tag}>, not with <robot>")
+        if len(above) == 1 and tag in ("link", "joint"):
+            elements.append(Element(tag, attributes, {tag: start}))
+        elif above[1:] == ["joint"] and tag not in elements[-1].starts:
+            elements[-1].starts[tag] = start
+            for name, value in attributes.items():
+                elements[-1].stated[f"{tag} {name}"] = value
+        count += len(above) < 3
+        require_at_most(count, "elements", "links, joints and elements in them")
+        above.append(tag)
+
+    def refuse(*_: object) -> None:
+        raise ValueError("it has a DOCTYPE, which no URDF needs; remove it")
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = begin
+    parser.EndElementHandler = lambda _: above.pop()
+    parser.StartDoctypeDeclHandler = refuse
+    try:
+        parser.Parse(data[blank:], True)
+    except expat.ExpatError as error:
+        raise ValueError(
+            f"it is no XML: {error}; a part is missing, a tag is wrong, or the text is not UTF-8"
+        ) from None
+    return elements
+
+
+def _joint(element: Element) -> Joint:
+    numbers = {}
+    for name, default in _DEFAULTS.items():
+        count = len(default.split())
+        text = element.stated.get(name, default)
+        try:
+            numbers[name] = [*map(float, text.split())]
+        except ValueError:
+            numbers[name] = []
+        bad = name in element.stated and not all(map(math.isfinite, numbers[name]))
+        if bad or len(numbers[name]) != count:
+            what = {1: "is no finite number", 3: "are not three finite numbers"}
+            raise ValueError(f"'{text}' {what[count]}")
+    return Joint(*_required(element, *_ENDS), numbers=numbers, element=element)
+
+
+def _required(element: Element, *names: str) -> list[str]:
+    for name in names:
+        if name not in element.stated:
+            raise ValueError(f"its {name} is missing")
+    return [element.stated[name] for name in names]
