@@ -65,15 +65,8 @@ class Joint:
         return ""
 
 
-class Urdf(NamedTuple):
-    """Names of links, and joints, in the order of the file."""
-
-    links: tuple[str, ...]
-    joints: tuple[Joint, ...]
-
-
-def read_urdf(path: Path) -> Urdf:
-    """Read the links and joints of a file; all else is skipped.
+def read_urdf(path: Path) -> tuple[tuple[str, ...], tuple[Joint, ...]]:
+    """Read the names of links and the joints of a file, in its order; all else is skipped.
 
     Raises:
         InputError: It is no XML, or one of them is incomplete.
@@ -83,19 +76,22 @@ def read_urdf(path: Path) -> Urdf:
         return parsed_urdf(path.read_bytes())
 
 
-def parsed_urdf(data: bytes) -> Urdf:
+def parsed_urdf(data: bytes) -> tuple[tuple[str, ...], tuple[Joint, ...]]:
     """Parse links and joints; ValueError as for `read_urdf`."""
     links = []
     joints = []
     for element in _elements(data):
         with naming(f"{element.tag} {element.stated.get('name')}"):
-            if element.tag == "joint":
-                joints.append(_joint(element))
-            else:
-                links += _required(element, "name")
+            try:
+                if element.tag == "joint":
+                    joints.append(_joint(element))
+                else:
+                    links.append(element.stated["name"])
+            except KeyError as missing:
+                raise ValueError(f"its {missing} is missing") from None
     if not links:
         raise ValueError("it has no links; make a URDF of a macro file with xacro")
-    return Urdf(tuple(links), tuple(joints))
+    return tuple(links), tuple(joints)
 
 
 def _elements(data: bytes) -> list[Element]:
@@ -112,7 +108,7 @@ def _elements(data: bytes) -> list[Element]:
             raise ValueError(f"it begins with <{tag}>, not with <robot>")
         if len(above) == 1 and tag in ("link", "joint"):
             elements.append(Element(tag, attributes, {tag: start}))
-        elif above[1:] == ["joint"] and tag not in elements[-1].starts:
+        elif len(above) == 2 and above[1] == "joint" and tag not in elements[-1].starts:
             elements[-1].starts[tag] = start
             for name, value in attributes.items():
                 elements[-1].stated[f"{tag} {name}"] = value
@@ -137,23 +133,17 @@ def _elements(data: bytes) -> list[Element]:
 
 
 def _joint(element: Element) -> Joint:
+    name, kind, parent, child = map(element.stated.__getitem__, _ENDS)
     numbers = {}
-    for name, default in _DEFAULTS.items():
-        count = len(default.split())
-        text = element.stated.get(name, default)
+    for key, default in _DEFAULTS.items():
+        text = element.stated.get(key, default)
         try:
-            numbers[name] = [*map(float, text.split())]
+            numbers[key] = [*map(float, text.split())]
         except ValueError:
-            numbers[name] = []
-        bad = name in element.stated and not all(map(math.isfinite, numbers[name]))
-        if bad or len(numbers[name]) != count:
+            numbers[key] = []
+        count = len(default.split())
+        finite = key.startswith("limit") or all(map(math.isfinite, numbers[key]))
+        if len(numbers[key]) != count or not finite:
             what = {1: "is no finite number", 3: "are not three finite numbers"}
             raise ValueError(f"'{text}' {what[count]}")
-    return Joint(*_required(element, *_ENDS), numbers=numbers, element=element)
-
-
-def _required(element: Element, *names: str) -> list[str]:
-    for name in names:
-        if name not in element.stated:
-            raise ValueError(f"its {name} is missing")
-    return [element.stated[name] for name in names]
+    return Joint(name, kind, parent, child, numbers, element)

@@ -128,7 +128,9 @@ def test_a_urdf_of_two_bytes_a_letter_is_refused(tmp_path: Path, encoding: str) 
     text = URDF.replace('"1.0"?>', '"1.0" encoding="utf-16"?>')
     file = file_of(tmp_path, text, encoding)
     assert RobotModel(file).arm("base", "tip").joints[1] == "elbow"
-    with pytest.raises(InputError, match=r"arm.urdf: its text is not UTF-8; save it so"):
+    with pytest.raises(
+        InputError, match=r"arm.urdf: its text is not UTF-8; save it so"
+    ):
         ARM.export("corrected_urdf", tmp_path / "new.urdf", urdf=file)
     assert not (tmp_path / "new.urdf").exists()
 

@@ -73,7 +73,7 @@ def _with_origins(urdf: bytes, moved: Mapping[str, tuple[SE3, bool]]) -> bytes:
 
     The result is read again, and its numbers are compared with the wanted ones.
     """
-    joints = {joint.name: joint for joint in parsed_urdf(urdf).joints}
+    joints = {joint.name: joint for joint in parsed_urdf(urdf)[1]}
     wanted = {name: joint.numbers for name, joint in joints.items()}
     # The last first, so that places before it stay.
     for name in sorted(moved, key=lambda name: -joints[name].element.starts["joint"]):
@@ -97,7 +97,7 @@ def _with_origins(urdf: bytes, moved: Mapping[str, tuple[SE3, bool]]) -> bytes:
             tag += b"<origin/>"
         tag = tag.replace(b"<origin", attribute, 1)
         urdf = urdf[:start] + tag + urdf[match.end() :]
-    written = {joint.name: joint.numbers for joint in parsed_urdf(urdf).joints}
+    written = {joint.name: joint.numbers for joint in parsed_urdf(urdf)[1]}
     if written != wanted:
         raise ValueError("its origins cannot be replaced; write them in a simpler way")
     return urdf

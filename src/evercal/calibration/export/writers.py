@@ -10,6 +10,7 @@ import io
 import json
 import re
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import yaml
@@ -21,32 +22,34 @@ from evercal.geometry import SE3
 _MOVE_GROUP = {"move_group_namespace": "/", "move_group": "manipulator"}
 
 
-def _text(
-    convention: str, template: str, number: Callable[[float], str] = repr
-) -> Callable[[Export], str]:
-    """Return the writer of a text with the pose as numbers; frame names need no quotes."""
+@dataclass(frozen=True)
+class _Text:
+    """The writer of a text with the pose as numbers; frame names need no quotes."""
 
-    def write(export: Export) -> str:
+    convention: str
+    template: str
+    number: Callable[[float], str] = repr
+
+    def __call__(self, export: Export) -> str:
         frames = f"{export.parent}_to_{export.child}"
-        return template.format(
-            *map(number, export.numbers(convention)),
+        return self.template.format(
+            *map(self.number, export.numbers(self.convention)),
             parent=export.parent,
             child=export.child,
-            node=re.sub(r"\W", "_", frames),
+            # In ROS 1, a node's name begins with a letter.
+            node=re.sub(r"^(?=[\d_])", "tf_", re.sub(r"\W", "_", frames)),
             joint=re.sub(r"[^\w.-]", "_", frames),
             comment=export.comment,
-            xml=export.comment.replace("--", "- -"),
+            xml=re.sub("-(?=-)", "- ", export.comment),
         )
 
-    return write
 
-
-command = _text(
+command = _Text(
     "xyzw",
     "ros2 run tf2_ros static_transform_publisher --x {} --y {} --z {} --qx {} --qy {} --qz {}"
     " --qw {} --frame-id {parent} --child-frame-id {child}\n",
 )
-launch_py = _text(
+launch_py = _Text(
     "xyzw",
     """# {comment}
 from launch import LaunchDescription
@@ -76,7 +79,7 @@ def generate_launch_description():
     )
 """,
 )
-ros1_launch = _text(
+ros1_launch = _Text(
     "xyzw",
     """<launch>
   <!-- {xml} x y z qx qy qz qw parent child -->
@@ -86,7 +89,7 @@ ros1_launch = _text(
 """,
 )
 # R = Rz(yaw) Ry(pitch) Rx(roll), about fixed axes, in radians.
-urdf = _text(
+urdf = _Text(
     "rpy",
     """<joint name="{joint}" type="fixed">
   <!-- {xml} -->
@@ -96,9 +99,9 @@ urdf = _text(
 </joint>
 """,
 )
-csv = _text("matrix", "{},{},{},{}\n" * 4)
+csv = _Text("matrix", "{},{},{},{}\n" * 4)
 # Column by column in metres, like libfranka's O_T_EE.
-franka = _text("franka", f"[{', '.join(['{}'] * 16)}]\n")
+franka = _Text("franka", f"[{', '.join(['{}'] * 16)}]\n")
 
 
 def _nine(value: float) -> str:
@@ -106,16 +109,31 @@ def _nine(value: float) -> str:
     return f"{round(value, 9) + 0.0:.9f}"
 
 
-ur = _text("ur", "# {comment}\np[{}, {}, {}, {}, {}, {}]\n", _nine)
-kuka = _text("kuka", "; {comment}\n{{X {}, Y {}, Z {}, A {}, B {}, C {}}}\n", _nine)
-abb = _text("abb", "! {comment}\n[[{},{},{}],[{},{},{},{}]]\n", _nine)
-fanuc = _text("fanuc", "# {comment}\nX Y Z W P R\n{} {} {} {} {} {}\n", _nine)
-yaskawa = _text("yaskawa", "# {comment}\nX Y Z Rx Ry Rz\n{} {} {} {} {} {}\n", _nine)
-staubli = _text("staubli", "# {comment}\nX Y Z RX RY RZ\n{} {} {} {} {} {}\n", _nine)
+ur = _Text("ur", "# {comment}\np[{}, {}, {}, {}, {}, {}]\n", _nine)
+kuka = _Text("kuka", "; {comment}\n{{X {}, Y {}, Z {}, A {}, B {}, C {}}}\n", _nine)
+abb = _Text("abb", "! {comment}\n[[{},{},{}],[{},{},{},{}]]\n", _nine)
+fanuc = _Text("fanuc", "# {comment}\nX Y Z W P R\n{} {} {} {} {} {}\n", _nine)
+yaskawa = _Text("yaskawa", "# {comment}\nX Y Z Rx Ry Rz\n{} {} {} {} {} {}\n", _nine)
+staubli = _Text("staubli", "# {comment}\nX Y Z RX RY RZ\n{} {} {} {} {} {}\n", _nine)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes texts with digits, as 1e5 and 0o17 are numbers to some readers."""
+
+    def represent_str(self, data: str) -> yaml.ScalarNode:
+        node = super().represent_str(data)
+        if re.search(r"\d", data):
+            node.style = '"'
+        return node
+
+
+_Dumper.add_representer(str, _Dumper.represent_str)
 
 
 def _yaml(record: object, flow: bool | None = False, width: int = 80) -> str:
-    return yaml.safe_dump(record, sort_keys=False, default_flow_style=flow, width=width)
+    return yaml.dump(
+        record, Dumper=_Dumper, sort_keys=False, default_flow_style=flow, width=width
+    )
 
 
 def stamped(export: Export) -> str:
@@ -255,7 +273,8 @@ def zivid(export: Export) -> str:
     return _yaml(record, None)
 
 
-def _image_poses(export: Export) -> tuple[tuple[str, ...], SE3]:
+def image_poses(export: Export) -> tuple[tuple[str, ...], SE3]:
+    """Names of images, and base_from_camera of each."""
     robot = export.robot_poses
     if not export.in_hand:
         used = tuple(image.name for image in export.calibration.images if image.used)
@@ -272,7 +291,7 @@ def _image_poses(export: Export) -> tuple[tuple[str, ...], SE3]:
 
 def tum(export: Export) -> str:
     """Write lines of stamp, translation in metres, quaternion x y z w: base_from_camera."""
-    rows = pose_numbers(_image_poses(export)[1])
+    rows = pose_numbers(image_poses(export)[1])
     robot = export.robot_poses
     stamps = np.arange(len(rows), dtype=np.float64)
     if not export.in_hand:
@@ -287,7 +306,7 @@ def tum(export: Export) -> str:
 def colmap(export: Export) -> dict[str, str]:
     """Write a sparse model without points: camera_from_base, quaternion w x y z."""
     camera = export.camera
-    names, poses = _image_poses(export)
+    names, poses = image_poses(export)
     lines = []
     rows = pose_numbers(poses, "wxyz:inverse").tolist()
     for i, (name, row) in enumerate(zip(names, rows, strict=True)):
@@ -319,7 +338,7 @@ def colmap(export: Export) -> dict[str, str]:
 def nerfstudio(export: Export) -> str:
     """Write transforms.json: base_from_camera with camera axes x right, y up, z back."""
     camera = export.camera
-    names, poses = _image_poses(export)
+    names, poses = image_poses(export)
     model = "OPENCV"
     terms = ("k1", "k2", "p1", "p2", "k3")
     if camera.model == "fisheye":
