@@ -42,6 +42,12 @@ class Bounds:
     """Links and joints of a URDF, and elements in them."""
     numbers: int = 10_000_000
     """Numbers of an array, and cells of a table."""
+    recording_files: int = 200_000
+    """Files of a recording at an address."""
+    recording_bytes: int = 50 * 10**9
+    """Bytes of these files."""
+    marker_bytes: int = 10_000_000
+    """Text at an address that is copied before the format is recognised."""
     pixels: int = 100_000_000
     """Pixels of an image."""
     aspect: int = 5

@@ -9,6 +9,10 @@ from typing import Any
 
 _LONGEST = 2_000
 """Characters of a message, which may repeat what came from outside."""
+_USER = re.compile(
+    r"(?<=://)([^\s/@:]*:(?!\d+(/|\s|$))((?!::)[^\s'\"])*@|[^\s/@'\"]*@)"
+)
+_QUERY = re.compile(r"(://[^\s?'\"]*)\?((?!::)[^\s'\"])*?(?=:?(\s|['\"]|::|$))")
 _FIELD = re.compile(r"`([a-z]\w*)`")
 """An argument in a message: `robot_poses`."""
 
@@ -19,14 +23,16 @@ class InputError(Exception):
     The message is one line that names the thing, shows what came and says what to do next. The
     command line prints it and exits with status 2; anything else that is raised is a bug. Line
     breaks become spaces, and other control characters are escaped: names from damaged files can
-    hold any character. Arguments stand in backquotes, by their names in Python.
+    hold any character. Addresses are shown without secrets. Arguments stand in backquotes, by their
+    names in Python.
     """
 
     def __init__(self, message: str = ""):
         text = str(message)
         if len(text) > _LONGEST:
             text = f"{text[:_LONGEST]} ..."
-        super().__init__(printable(" ".join(text.splitlines())))
+        text = without_secrets(" ".join(text.splitlines()))
+        super().__init__(printable(text))
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -36,6 +42,11 @@ class InputError(Exception):
 
 class UnavailableError(InputError):
     """A map that cannot be read now; status 503 of the service."""
+
+
+def without_secrets(text: str) -> str:
+    """A text whose addresses lack user, password and query, chained ones (`::`) as well."""
+    return _QUERY.sub(r"\1", _USER.sub("", text))
 
 
 def with_options(text: str) -> str:

@@ -4,7 +4,6 @@ import dataclasses
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -147,7 +146,7 @@ class Learn(args.Verb):
 
             reports = cell.learn_many(
                 self.recordings,
-                read=partial(read_recording, self.reading),
+                read=_Reader(self.reading),
                 workers=self.workers,
                 ray=self.ray,
                 results=self.results,
@@ -234,6 +233,23 @@ def read_recording(
         for warning in pictures.warnings:
             say(f"warning: {recording.name}: {warning}", sys.stderr)
     return recording
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """Reads recordings in worker processes."""
+
+    reading: args.Reading
+
+    def __call__(self, path: Path) -> "Recording":
+        return read_recording(self.reading, path)
+
+    def check(self, path: Path) -> None:
+        """Refuse a folder of no known format, before its images are copied."""
+        from evercal.recordings.load import format_of
+
+        if self.reading.format is None:
+            format_of(path)
 
 
 def learn_into_networks(

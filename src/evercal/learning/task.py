@@ -22,6 +22,7 @@ from evercal.recordings import addresses, load_recording
 from evercal.recordings.addresses import RecordingAt
 from evercal.recordings.frame import Recording
 from evercal.recordings.held_out import named_recording
+from evercal.recordings.load import format_of
 
 _RESULT = "result"
 """Entry of a stored report: name of the file of results, which has the recording's digest."""
@@ -56,7 +57,8 @@ class LearnTask:
     options: MapOptions | None = None
     """Sizes and priors of the map."""
     read: Callable[[Path], Recording] = load_recording
-    """Reads the copy of a recording at an address; it can be pickled."""
+    """Reads the copy of a recording at an address; it can be pickled. Its attribute `check`, if it
+    has one, refuses a folder of which only small texts are copied yet."""
     results: str | None = None
     """Folder or address where learned scenes are kept: what lies there is not learned again."""
 
@@ -78,7 +80,10 @@ class LearnTask:
     def _learn(self, source: Source) -> tuple[SceneMap, LearnReport]:
         if isinstance(source, Recording):
             return learn_scene(source, self.contents, self.memory, options=self.options)
-        with addresses.local_copy(source.address) as copy:
+        check = getattr(self.read, "check", Path)
+        if self.read is load_recording:
+            check = format_of
+        with addresses.local_copy(source.address, check) as copy:
             return self._learn(named_recording(self.read(copy), source.name, ()))
 
     def result_of(self, source: Source) -> str | None:

@@ -1,15 +1,21 @@
 """Folders and files that all machines reach: paths, and addresses of object stores by fsspec."""
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Self
+from urllib.parse import urlsplit
 from uuid import uuid4
 
-from evercal.errors import InputError, optional_module
+from evercal.bounds import bounds, require_at_most
+from evercal.errors import InputError, optional_module, without_secrets
 from evercal.storage.text_files import library_errors
+
+Check = Callable[[Path], object]
+_TEXTS = (".csv", ".json", ".txt", ".urdf", ".yaml", ".yml")
+"""Endings of files by which recordings are recognised."""
 
 
 def is_address(text: object) -> bool:
@@ -27,41 +33,63 @@ class RecordingAt:
     @classmethod
     def of(cls, address: str) -> Self:
         """The recording at an address, with the name of its folder or file."""
-        return cls(address, PurePosixPath(address).name)
+        return cls(address, PurePosixPath(without_secrets(address)).name)
 
 
 @contextmanager
-def local_copy(address: str) -> Iterator[Path]:
+def local_copy(address: str, check: Check = Path) -> Iterator[Path]:
     """A copy of a folder or file on this machine, for a moment.
 
+    `check` refuses a copy in which all but small texts are still empty.
+
     Raises:
-        InputError: There is nothing, or it cannot be read.
+        InputError: There is nothing, it is too large, or it cannot be read.
     """
     with tempfile.TemporaryDirectory(prefix="evercal-") as folder:
-        with _store(address) as (store, root):
-            target = Path(folder, PurePosixPath(root).name or "root")
-            for file in _files(store, root, address):
-                inside = file.removeprefix(root).strip("/")
-                if ".." in inside.split("/"):
-                    raise InputError(
-                        f"{address}: its file {inside!r} leads out of it; rename it"
-                    )
-                copy = target / inside  # target itself where the address is a file
-                copy.parent.mkdir(parents=True, exist_ok=True)
-                store.get_file(file, str(copy))
-        yield target
+        target = Path(folder)
+        try:
+            with _store(address) as (store, root):
+                target /= PurePosixPath(root).name or "root"
+                _copy(store, root, target, check)
+            yield target
+        except InputError as error:
+            raise InputError(str(error).replace(str(target), address)) from None
+
+
+def _copy(store: Any, root: str, target: Path, check: Check) -> None:
+    small = []
+    large = []
+    for file, size in _files(store, root).items():
+        inside = file.removeprefix(root).strip("/")
+        if ".." in inside.split("/"):
+            raise ValueError(f"its file {inside!r} leads out of it; rename it")
+        copy = target / inside  # target itself where the address is a file
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.touch()
+        is_marker = copy.suffix in _TEXTS and size <= bounds().marker_bytes
+        (small if is_marker else large).append((file, copy, size))
+    for files in (small, large):
+        for file, copy, size in files:
+            store.get_file(file, str(copy))
+            if copy.stat().st_size < size:
+                raise ValueError(f"{copy.name} ended early; try again")
+        check(target)
 
 
 def stamps(address: str) -> list[tuple[str, ...]]:
     """Name and version of every file at an address; a file that changes gets another version."""
     with _store(address) as (store, root):
-        return [(file, str(store.ukey(file))) for file in _files(store, root, address)]
+        return [(file, str(store.ukey(file))) for file in _files(store, root)]
 
 
 def exists(address: str) -> bool:
-    """Whether there is a file."""
+    """Whether there is a file; an InputError if nobody answers."""
     with _store(address) as (store, path):
-        return store.exists(path)
+        try:
+            store.info(path)
+        except FileNotFoundError:
+            return False
+        return True
 
 
 def put(file: Path, address: str) -> None:
@@ -81,14 +109,47 @@ def put(file: Path, address: str) -> None:
 def _store(address: str) -> Iterator[tuple[Any, str]]:
     """The file system of an address, and the path in it; its errors name the address."""
     need = f"{address[:200]}: reading and writing it needs fsspec"
-    fsspec = optional_module("fsspec.core", need, "ray")
+    fsspec = optional_module("fsspec", need, "ray")
     with library_errors(f"{address}: cannot be read or written"):
-        yield fsspec.url_to_fs(address)
+        try:
+            store, root = fsspec.url_to_fs(address)
+            path = root
+            if "://" in root:  # HTTP keeps the host
+                path = urlsplit(root).path
+            if address.endswith("://") or not (path.strip("/") or "::" in address):
+                raise InputError(f"{address}: names no folder, as in s3://bucket/room")
+            yield store, root
+        except FileNotFoundError:
+            raise InputError(
+                f"{address}: no such folder or file, or no answer"
+            ) from None
+        except Exception:
+            for kind in fsspec.registry.values():
+                kind.clear_instance_cache()  # else the next try has the same connection
+            raise
 
 
-def _files(store: Any, root: str, address: str) -> list[str]:
+def _files(store: Any, root: str) -> dict[str, int]:
+    """Names of all files, sorted, and their sizes, as far as the store states them."""
     store.invalidate_cache()  # other machines write, too
-    files = sorted(store.find(root))
-    if not files:
-        raise InputError(f"{address}: no such folder or file")
-    return files
+    top = store.info(root)
+    sizes = {root: top["size"] or 0}
+    folders = []
+    if top["type"] == "directory" or store.isdir(root):
+        sizes = {}
+        folders = [root]
+    # fsspec's own `walk` and `find` leave out folders that cannot be listed.
+    for folder in folders:
+        for info in store.ls(folder, detail=True):
+            if info["name"].strip("/") == folder.strip("/"):
+                continue
+            if info["type"] == "directory":
+                folders.append(info["name"])
+            else:
+                sizes[info["name"]] = info["size"] or 0
+        count = len(folders) + len(sizes)
+        require_at_most(count, "recording_files", "files at an address")
+    require_at_most(sum(sizes.values()), "recording_bytes", "bytes at an address")
+    if not sizes:
+        raise FileNotFoundError(root)
+    return dict(sorted(sizes.items()))

@@ -94,7 +94,7 @@ def load_recording(
     """
     root = Path(path)
     options = options or ReadOptions()
-    format = _format_of(root, format)
+    format = format_of(root, format)
     uses = FORMATS[format].uses
     for option in options.given():
         if option not in ("every", *uses):
@@ -121,7 +121,8 @@ def load_recording(
     return recording
 
 
-def _format_of(root: Path, stated: FormatName | None) -> FormatName:
+def format_of(root: Path, stated: FormatName | None = None) -> FormatName:
+    """The format of a recording; one that is not known is refused."""
     if stated is not None and stated not in FORMATS:
         raise InputError(
             f"format {stated!r} is not known; use one of {', '.join(FORMATS)}"
