@@ -10,7 +10,7 @@ from typing import Any
 _LONGEST = 2_000
 """Characters of a message, which may repeat what came from outside."""
 _USER = re.compile(
-    r"(?<=://)([^\s/@:]*:(?!\d+(/|\s|$))((?!::)[^\s'\"])*@|[^\s/@'\"]*@)"
+    r"(?<=://)([^\s/@:'\"]*:(?!:|\d+(/|\s|$))((?!::)[^\s'\"])*@|[^\s/@'\"]*@)"
 )
 _QUERY = re.compile(r"(://[^\s?'\"]*)\?((?!::)[^\s'\"])*?(?=:?(\s|['\"]|::|$))")
 _FIELD = re.compile(r"`([a-z]\w*)`")

@@ -7,7 +7,6 @@ import shlex
 import sys
 import types
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 from xml.etree import ElementTree
@@ -350,62 +349,3 @@ def test_valid_frame_names_are_written(name: str) -> None:
 
 def test_names_of_formats_are_those_of_the_table() -> None:
     assert get_args(ExportFormat) == tuple(FORMATS)
-
-
-TF_FORMATS = [name for name, exporter in FORMATS.items() if exporter.frame == "tf"]
-
-
-@pytest.mark.parametrize(
-    "parent", ["a---b", "a--", "1cam", "_cam", "1e5", "0o17", "0x1f", "12"]
-)
-@pytest.mark.parametrize("name", TF_FORMATS)
-def test_odd_frame_names_are_read_back(name: str, parent: str) -> None:
-    text = calibration_of(POSE).export(name, parent=parent, child=f"{parent}.x")
-    _, read_parent, read_child = READERS[name](text)
-    assert (read_parent, read_child) == (parent, f"{parent}.x")
-    if name.endswith(("launch_py", "ros1_launch")):
-        (node,) = re.findall(r"name=\"(.*?)\"", text)
-        assert re.fullmatch(r"[a-zA-Z]\w*", node, re.ASCII)
-    if FORMATS[name].ending in (".yaml", ".calib"):
-        # Plain, YAML 1.2 and PyYAML read other numbers than one another.
-        assert not re.search(rf": {parent}$", text, re.MULTILINE) or parent[0] in "a_"
-
-
-@pytest.mark.parametrize(
-    ("name", "written", "wrong", "message"),
-    [
-        ("urdf", "-->", "-- -->", "not well-formed"),
-        ("urdf", "<parent link=", "<parent link='x' link=", "duplicate attribute"),
-        ("transform_stamped", "    x: ", "    x: 1", "its numbers are"),
-        ("easy_handeye", "  z: ", "  z: -", "its numbers are|not of length|could not"),
-        (
-            "launch_py",
-            '"--frame-id", "',
-            '"--frame-id", "other_',
-            "frame base_link is not",
-        ),
-        ("static_transform_publisher", "--x ", "--x '", "No closing quotation"),
-        ("kuka", "{X ", "{X 9", "its numbers are"),
-        ("csv", ",", ",9", "its numbers are|window"),
-    ],
-)
-def test_what_would_be_read_in_another_way_is_not_written(
-    name: str, written: str, wrong: str, message: str, tmp_path: Path
-) -> None:
-    """Every text is parsed once more before it is written."""
-    exporter = FORMATS[name]
-
-    def write(export: Any) -> str:
-        text = exporter.write(export)
-        assert isinstance(text, str)
-        assert written in text
-        return text.replace(written, wrong, 1)
-
-    write.convention = getattr(exporter.write, "convention", exporter.numbers)  # pyright: ignore[reportFunctionMemberAccess]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(FORMATS, name, replace(exporter, write=write))
-        with pytest.raises(
-            InputError, match=f"{name}: it would not be read .*({message})"
-        ):
-            calibration_of(POSE).export(name, tmp_path / "out")
-    assert not (tmp_path / "out").exists()

@@ -34,8 +34,6 @@ class Exporter:
     """One line for `--format list`."""
     per_image: bool = False
     """Whether a camera on the arm needs the robot's pose of every image."""
-    numbers: str = "xyzw"
-    """Convention of the pose in it, if `write` has none; empty if it holds none."""
 
 
 FORMATS: dict[str, Exporter] = {
@@ -46,7 +44,7 @@ FORMATS: dict[str, Exporter] = {
         "tf", to.easy_handeye, ".yaml", "for ~/.ros/easy_handeye of ROS 1"
     ),
     "moveit_samples": Exporter(
-        "optical", to.moveit, ".yaml", "MoveIt Calibration's pairs", True, numbers=""
+        "optical", to.moveit, ".yaml", "MoveIt Calibration's pairs", True
     ),
     "static_transform_publisher": Exporter(
         "tf", to.command, ".sh", "shell command for ROS 2"
@@ -60,57 +58,27 @@ FORMATS: dict[str, Exporter] = {
     "transform_stamped": Exporter(
         "tf", to.stamped, ".yaml", "geometry_msgs/TransformStamped"
     ),
-    "camera_info": Exporter(
-        "optical", to.camera_info, ".yaml", "intrinsics for ROS", numbers=""
-    ),
+    "camera_info": Exporter("optical", to.camera_info, ".yaml", "intrinsics for ROS"),
     "urdf": Exporter(
         "tf", to.urdf, ".urdf", "fixed joint for a URDF, rpy about fixed axes"
     ),
-    "opencv": Exporter(
-        "optical",
-        to.opencv,
-        ".yml",
-        "rvec and tvec, parent to camera",
-        numbers="ur:inverse",
-    ),
+    "opencv": Exporter("optical", to.opencv, ".yml", "rvec and tvec, parent to camera"),
     "csv": Exporter(
         "any", to.csv, ".csv", "4x4 matrix, metres, one matrix row per line"
     ),
-    "npy": Exporter(
-        "any", to.npy, ".npy", "4x4 matrix, metres, for numpy", numbers="matrix"
-    ),
+    "npy": Exporter("any", to.npy, ".npy", "4x4 matrix, metres, for numpy"),
     "json": Exporter(
-        "any",
-        to.as_json,
-        ".json",
-        "matrix, quaternion wxyz, covariance, frames",
-        numbers="matrix",
+        "any", to.as_json, ".json", "matrix, quaternion wxyz, covariance, frames"
     ),
     "tum": Exporter(
         "optical", to.tum, ".tum", "stamp, translation, quaternion x y z w", True
     ),
     "colmap": Exporter(
-        "optical",
-        to.colmap,
-        "",
-        "a model without points (folder)",
-        True,
-        numbers="wxyz:inverse",
+        "optical", to.colmap, "", "a model without points (folder)", True
     ),
-    "nerfstudio": Exporter(
-        "optical",
-        to.nerfstudio,
-        ".json",
-        "transforms.json",
-        True,
-        numbers="matrix:opengl",
-    ),
+    "nerfstudio": Exporter("optical", to.nerfstudio, ".json", "transforms.json", True),
     "zivid": Exporter(
-        "any",
-        to.zivid,
-        ".txt",
-        "4x4 matrix in millimetres for Zivid's SDK",
-        numbers="matrix:mm",
+        "any", to.zivid, ".txt", "4x4 matrix in millimetres for Zivid's SDK"
     ),
     "ur": Exporter("any", to.ur, ".txt", "Universal Robots: p[x, y, z, rx, ry, rz]"),
     "kuka": Exporter(
@@ -128,17 +96,13 @@ FORMATS: dict[str, Exporter] = {
         "any", to.franka, ".txt", "Franka: 16 numbers by column, metres"
     ),
     "joint_offsets": Exporter(
-        "any", arm.joint_offsets, ".json", "offsets of the arm's joints", numbers=""
+        "any", arm.joint_offsets, ".json", "offsets of the arm's joints"
     ),
     "corrected_urdf": Exporter(
-        "any", arm.corrected_urdf, ".urdf", "`urdf` with these offsets", numbers=""
+        "any", arm.corrected_urdf, ".urdf", "`urdf` with these offsets"
     ),
     "lerobot": Exporter(
-        "any",
-        arm.lerobot,
-        ".json",
-        "`lerobot_calibration` with these offsets",
-        numbers="",
+        "any", arm.lerobot, ".json", "`lerobot_calibration` with these offsets"
     ),
 }
 """All formats by name, an `ExportFormat`."""
@@ -187,7 +151,9 @@ def export_files(
         )
     try:
         content = exporter.write(export)
-        _read_back(exporter, export, content)
+        if isinstance(content, str):
+            is_tf = exporter.frame == "tf"
+            require_read_back(content, exporter.ending, export, is_tf)
     except InputError as error:
         raise InputError(f"{key}: {error}") from None
     text = ""
@@ -199,19 +165,6 @@ def export_files(
     if not text:
         raise InputError(f"{key} is not text and cannot be printed; give `out`")
     return Exported(exporter, export.calibration, text, ())
-
-
-def _read_back(exporter: Exporter, export: Export, content: Content) -> None:
-    convention = getattr(exporter.write, "convention", exporter.numbers)
-    if not convention:
-        return
-    pose = export.pose
-    if exporter.per_image:
-        pose = to.image_poses(export)[1][0]
-    frames = []
-    if exporter.frame == "tf":
-        frames = [export.parent, export.child]
-    require_read_back(content, exporter.ending, convention, pose, frames)
 
 
 def _write(path: Path, content: Content) -> tuple[Path, ...]:

@@ -1,28 +1,23 @@
-"""What an exporter wrote is parsed again, and its pose and frames are compared."""
+"""What an exporter wrote is parsed again, and its numbers and frames are compared."""
 
 import ast
-import io
 import json
 import re
 import shlex
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable
 from xml.etree import ElementTree
 
 import numpy as np
 import yaml
 
-from evercal.calibration.export.request import pose_numbers
-from evercal.geometry import SE3, pose_distance
-from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
+from evercal.calibration.export.request import Export
 from evercal.storage.text_files import library_errors
 
-_TOLERANCE = 1e-6
-"""Metres and radians, and share of a length; robot controllers get nine decimals."""
-_NO_POSE = re.compile(r"^(?:[#;!%]| +rows:| +cols:).*$", re.MULTILINE)
-"""Comments of files of numbers, and sizes in OpenCV's."""
+_COMMENT = re.compile(r"^[#;!].*$", re.MULTILINE)
 _WORD = re.compile(r"[\w./+-]+")
 _NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
+_ROUNDING = 1e-8
+"""Robot controllers get nine decimals."""
 
 
 def _of_python(text: str) -> list[object]:
@@ -38,7 +33,7 @@ def _of_yaml(text: str) -> object:
     return yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
 
 
-_PARSERS: dict[str, Callable[[Any], object]] = {
+_PARSERS: dict[str, Callable[[str], object]] = {
     ".json": json.loads,
     ".yaml": _of_yaml,
     ".calib": _of_yaml,
@@ -46,32 +41,21 @@ _PARSERS: dict[str, Callable[[Any], object]] = {
     ".launch": _of_xml,
     ".urdf": _of_xml,
     ".sh": shlex.split,
-    ".npy": lambda data: np.load(io.BytesIO(data)).tolist(),
-    "": lambda files: files["images.txt"],
 }
 """By ending; other files are lines of numbers."""
 
 
-def require_read_back(
-    content: object, ending: str, convention: str, pose: SE3, frames: Iterable[str]
-) -> None:
-    """Refuse content that does not state a pose in a convention, and names of frames."""
+def require_read_back(text: str, ending: str, export: Export, tf: bool) -> None:
+    """Refuse a text without the numbers of the pose in a row, or, for tf, names of its frames."""
     with library_errors("it would not be read as it is meant; report this"):
-        parsed = _PARSERS.get(ending, str)(content)
-        if not isinstance(parsed, str):
-            parsed = json.dumps(parsed)
-        words = _WORD.findall(_NO_POSE.sub("", parsed))
-        for frame in frames:
-            if frame not in words:
-                raise ValueError(f"frame {frame} is not in it")
+        parsed = _COMMENT.sub("", text)
+        if ending in _PARSERS:
+            parsed = json.dumps(_PARSERS[ending](text))
+        words = _WORD.findall(parsed)
+        if tf and not {export.parent, export.child} <= {*words}:
+            raise ValueError("it lacks a frame")
         numbers = np.array([float(word) for word in words if _NUMBER.fullmatch(word)])
-        first = 0
-        if ending in ("", ".yml"):  # COLMAP and OpenCV have the rotation first
-            first = 3
-        wanted = np.roll(pose_numbers(pose, convention), -first)
-        windows = np.lib.stride_tricks.sliding_window_view(numbers, len(wanted))
-        nearest = windows[np.abs(windows - wanted).max(axis=1).argmin()]
-        read = poses_from_numbers(np.roll(nearest, first), pose_convention(convention))
-        most = _TOLERANCE * (1 + np.linalg.norm(pose.translation_m))
-        if max(pose_distance(read, pose)) > most:
-            raise ValueError(f"its numbers are {nearest.tolist()}")
+        for stated in export.stated:
+            windows = np.lib.stride_tricks.sliding_window_view(numbers, len(stated))
+            if np.abs(windows - stated).max(axis=1).min() > _ROUNDING:
+                raise ValueError(f"the numbers {stated} are not in it")

@@ -10,7 +10,6 @@ import io
 import json
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import yaml
@@ -22,18 +21,15 @@ from evercal.geometry import SE3
 _MOVE_GROUP = {"move_group_namespace": "/", "move_group": "manipulator"}
 
 
-@dataclass(frozen=True)
-class _Text:
-    """The writer of a text with the pose as numbers; frame names need no quotes."""
+def _text(
+    convention: str, template: str, number: Callable[[float], str] = repr
+) -> Callable[[Export], str]:
+    """Return the writer of a text with the pose as numbers; frame names need no quotes."""
 
-    convention: str
-    template: str
-    number: Callable[[float], str] = repr
-
-    def __call__(self, export: Export) -> str:
+    def write(export: Export) -> str:
         frames = f"{export.parent}_to_{export.child}"
-        return self.template.format(
-            *map(self.number, export.numbers(self.convention)),
+        return template.format(
+            *map(number, export.numbers(convention)),
             parent=export.parent,
             child=export.child,
             # In ROS 1, a node's name begins with a letter.
@@ -43,13 +39,15 @@ class _Text:
             xml=re.sub("-(?=-)", "- ", export.comment),
         )
 
+    return write
 
-command = _Text(
+
+command = _text(
     "xyzw",
     "ros2 run tf2_ros static_transform_publisher --x {} --y {} --z {} --qx {} --qy {} --qz {}"
     " --qw {} --frame-id {parent} --child-frame-id {child}\n",
 )
-launch_py = _Text(
+launch_py = _text(
     "xyzw",
     """# {comment}
 from launch import LaunchDescription
@@ -79,7 +77,7 @@ def generate_launch_description():
     )
 """,
 )
-ros1_launch = _Text(
+ros1_launch = _text(
     "xyzw",
     """<launch>
   <!-- {xml} x y z qx qy qz qw parent child -->
@@ -89,7 +87,7 @@ ros1_launch = _Text(
 """,
 )
 # R = Rz(yaw) Ry(pitch) Rx(roll), about fixed axes, in radians.
-urdf = _Text(
+urdf = _text(
     "rpy",
     """<joint name="{joint}" type="fixed">
   <!-- {xml} -->
@@ -99,9 +97,9 @@ urdf = _Text(
 </joint>
 """,
 )
-csv = _Text("matrix", "{},{},{},{}\n" * 4)
+csv = _text("matrix", "{},{},{},{}\n" * 4)
 # Column by column in metres, like libfranka's O_T_EE.
-franka = _Text("franka", f"[{', '.join(['{}'] * 16)}]\n")
+franka = _text("franka", f"[{', '.join(['{}'] * 16)}]\n")
 
 
 def _nine(value: float) -> str:
@@ -109,12 +107,12 @@ def _nine(value: float) -> str:
     return f"{round(value, 9) + 0.0:.9f}"
 
 
-ur = _Text("ur", "# {comment}\np[{}, {}, {}, {}, {}, {}]\n", _nine)
-kuka = _Text("kuka", "; {comment}\n{{X {}, Y {}, Z {}, A {}, B {}, C {}}}\n", _nine)
-abb = _Text("abb", "! {comment}\n[[{},{},{}],[{},{},{},{}]]\n", _nine)
-fanuc = _Text("fanuc", "# {comment}\nX Y Z W P R\n{} {} {} {} {} {}\n", _nine)
-yaskawa = _Text("yaskawa", "# {comment}\nX Y Z Rx Ry Rz\n{} {} {} {} {} {}\n", _nine)
-staubli = _Text("staubli", "# {comment}\nX Y Z RX RY RZ\n{} {} {} {} {} {}\n", _nine)
+ur = _text("ur", "# {comment}\np[{}, {}, {}, {}, {}, {}]\n", _nine)
+kuka = _text("kuka", "; {comment}\n{{X {}, Y {}, Z {}, A {}, B {}, C {}}}\n", _nine)
+abb = _text("abb", "! {comment}\n[[{},{},{}],[{},{},{},{}]]\n", _nine)
+fanuc = _text("fanuc", "# {comment}\nX Y Z W P R\n{} {} {} {} {} {}\n", _nine)
+yaskawa = _text("yaskawa", "# {comment}\nX Y Z Rx Ry Rz\n{} {} {} {} {} {}\n", _nine)
+staubli = _text("staubli", "# {comment}\nX Y Z RX RY RZ\n{} {} {} {} {} {}\n", _nine)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -273,8 +271,7 @@ def zivid(export: Export) -> str:
     return _yaml(record, None)
 
 
-def image_poses(export: Export) -> tuple[tuple[str, ...], SE3]:
-    """Names of images, and base_from_camera of each."""
+def _image_poses(export: Export) -> tuple[tuple[str, ...], SE3]:
     robot = export.robot_poses
     if not export.in_hand:
         used = tuple(image.name for image in export.calibration.images if image.used)
@@ -291,7 +288,7 @@ def image_poses(export: Export) -> tuple[tuple[str, ...], SE3]:
 
 def tum(export: Export) -> str:
     """Write lines of stamp, translation in metres, quaternion x y z w: base_from_camera."""
-    rows = pose_numbers(image_poses(export)[1])
+    rows = pose_numbers(_image_poses(export)[1])
     robot = export.robot_poses
     stamps = np.arange(len(rows), dtype=np.float64)
     if not export.in_hand:
@@ -306,7 +303,7 @@ def tum(export: Export) -> str:
 def colmap(export: Export) -> dict[str, str]:
     """Write a sparse model without points: camera_from_base, quaternion w x y z."""
     camera = export.camera
-    names, poses = image_poses(export)
+    names, poses = _image_poses(export)
     lines = []
     rows = pose_numbers(poses, "wxyz:inverse").tolist()
     for i, (name, row) in enumerate(zip(names, rows, strict=True)):
@@ -338,7 +335,7 @@ def colmap(export: Export) -> dict[str, str]:
 def nerfstudio(export: Export) -> str:
     """Write transforms.json: base_from_camera with camera axes x right, y up, z back."""
     camera = export.camera
-    names, poses = image_poses(export)
+    names, poses = _image_poses(export)
     model = "OPENCV"
     terms = ("k1", "k2", "p1", "p2", "k3")
     if camera.model == "fisheye":
