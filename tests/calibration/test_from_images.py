@@ -17,9 +17,9 @@ from evercal.calibration.from_images import calibrate
 from evercal.calibration.from_map.spots import _spots as spots_of
 from evercal.calibration.from_map.spots import from_many_spots
 from evercal.calibration.image_source import Images
-from evercal.calibration.located import ImagePose, deviations, fuse, in_parent_frame
+from evercal.calibration.located import ImagePose, fuse, in_parent_frame
 from evercal.errors import InputError
-from evercal.geometry import SE3, UncertainPose, pose_distance
+from evercal.geometry import SE3, UncertainPose, deviations, pose_distance
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_map import MapContents

@@ -267,7 +267,7 @@ def test_urdfs_without_one_meaning_are_refused(
         (("<parent ", "<parnt "), "joint j: its 'parent link' is missing"),
         (('<child link="b"', '<child lnk="b"'), "joint j: its 'child link' is missing"),
         (('<link name="a"/>', "<link/>"), "URDF: link None: its 'name' is missing"),
-        (('lower="-3"', 'lower="left"'), "joint j: 'left' is no finite number"),
+        (('lower="-3"', 'lower="left"'), "joint j: 'left' are not one finite number"),
     ],
 )  # fmt: skip
 def test_what_is_no_urdf_is_refused_in_one_line(

@@ -16,17 +16,15 @@ from evercal.calibration.held_thing.held_again import LEAST_GRIPS, held_again
 from evercal.calibration.located import (
     Fused,
     ImagePose,
-    deviations,
     fuse,
     in_parent_frame,
-    length_mm_deg,
     locate,
     mean_covariance,
     of_cause,
     shows_held_thing,
 )
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, axis_deviation
+from evercal.geometry import SE3, Camera, axis_deviation, deviations, length_mm_deg
 from evercal.recordings.images import Picture
 from evercal.typing import Array
 

@@ -21,7 +21,6 @@ from evercal.calibration.image_source import Images
 from evercal.calibration.located import (
     Fused,
     ImagePose,
-    deviations,
     fuse,
     halves_apart,
     in_parent_frame,
@@ -33,7 +32,7 @@ from evercal.calibration.located import (
 )
 from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, deviations
 from evercal.geometry.camera import COEFFICIENTS
 from evercal.localization.intrinsics import STATED, cameras_in_scenes
 from evercal.recordings.images import pixels_of

@@ -14,6 +14,8 @@ from evercal.geometry import (
     Camera,
     UncertainPose,
     average_poses,
+    deviations,
+    length_mm_deg,
     pose_distance_mm_deg,
 )
 from evercal.localization.pictures import localize_picture
@@ -187,13 +189,6 @@ def fuse(located: Sequence[ImagePose]) -> Fused:
     return Fused(mean, scatter, used, tuple(uses), str(scene))
 
 
-def deviations(poses: SE3, mean: SE3) -> Array:
-    """Return (n, 6) translations in the parent frame and rotations about child axes."""
-    shift = poses.translation_m - mean.translation_m
-    rotation = (mean.inverse() @ poses).log()[:, 3:]
-    return np.concatenate([shift, rotation], axis=1)
-
-
 def _far(off: Array) -> BoolArray:
     distance = np.linalg.norm(off.reshape(-1, 2, 3), axis=2)
     # For three Gaussian axes the median distance is 1.54 standard deviations.
@@ -201,13 +196,6 @@ def _far(off: Array) -> BoolArray:
     return (
         distance > np.maximum(_OUTLIER_SIGMAS * spread, (_LEAST_M, _LEAST_RAD))
     ).any(1)
-
-
-def length_mm_deg(deviation: Array) -> tuple[float, float]:
-    """Return the length of one deviation (6,) in millimetres and degrees."""
-    millimetres = 1000 * float(np.linalg.norm(deviation[:3]))
-    degrees = float(np.rad2deg(np.linalg.norm(deviation[3:])))
-    return millimetres, degrees
 
 
 def halves_apart(poses: SE3) -> tuple[float, float] | None:

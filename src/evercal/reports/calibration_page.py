@@ -7,10 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from evercal.calibration.calibration import Calibration
-from evercal.calibration.located import deviations, length_mm_deg
 from evercal.calibration.verdict import expected_error, verdict
 from evercal.errors import InputError
-from evercal.geometry import SE3
+from evercal.geometry import SE3, deviations, length_mm_deg
 from evercal.reports.calibration_images import AnnotatedImages
 from evercal.reports.calibration_tables import (
     camera_table,

@@ -11,7 +11,12 @@ from xml.parsers import expat
 from evercal.bounds import require_at_most
 from evercal.storage.text_files import named_errors, naming
 
-_ENDS = ("name", "type", "parent link", "child link")
+_ENDS = (
+    "name",
+    "type",
+    "parent link",
+    "child link",
+)
 _DEFAULTS = {
     "origin xyz": "0 0 0",
     "origin rpy": "0 0 0",
@@ -137,13 +142,13 @@ def _joint(element: Element) -> Joint:
     numbers = {}
     for key, default in _DEFAULTS.items():
         text = element.stated.get(key, default)
+        count = len(default.split())
         try:
             numbers[key] = [*map(float, text.split())]
         except ValueError:
             numbers[key] = []
-        count = len(default.split())
         finite = key.startswith("limit") or all(map(math.isfinite, numbers[key]))
         if len(numbers[key]) != count or not finite:
-            what = {1: "is no finite number", 3: "are not three finite numbers"}
-            raise ValueError(f"'{text}' {what[count]}")
+            what = "three finite numbers" if count == 3 else "one finite number"
+            raise ValueError(f"'{text}' are not {what}")
     return Joint(name, kind, parent, child, numbers, element)

@@ -151,7 +151,7 @@ def export_files(
         )
     try:
         content = exporter.write(export)
-        if isinstance(content, str):
+        if isinstance(content, str) and export.stated:
             is_tf = exporter.frame == "tf"
             require_read_back(content, exporter.ending, export, is_tf)
     except InputError as error:

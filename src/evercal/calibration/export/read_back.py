@@ -29,14 +29,10 @@ def _of_xml(text: str) -> list[dict[str, str]]:
     return [element.attrib for element in ElementTree.fromstring(text).iter()]
 
 
-def _of_yaml(text: str) -> object:
-    return yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-
-
 _PARSERS: dict[str, Callable[[str], object]] = {
     ".json": json.loads,
-    ".yaml": _of_yaml,
-    ".calib": _of_yaml,
+    ".yaml": yaml.safe_load,
+    ".calib": yaml.safe_load,
     ".launch.py": _of_python,
     ".launch": _of_xml,
     ".urdf": _of_xml,

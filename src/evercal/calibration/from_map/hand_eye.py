@@ -19,9 +19,8 @@ from evercal.calibration.checks import LearnedChecks
 from evercal.calibration.framed_pose import ImageUse, JointOffset
 from evercal.calibration.from_map.hand_eye_start import HandEyeStart
 from evercal.calibration.from_map.next_views import open_position
-from evercal.calibration.located import length_mm_deg
 from evercal.calibration.verdict import verdict
-from evercal.geometry import SE3, UncertainPose, pose_distance_mm_deg
+from evercal.geometry import SE3, UncertainPose, length_mm_deg, pose_distance_mm_deg
 from evercal.mapping.built_map import MOST_FOCAL_PERCENT, Adjusted, BuiltMap
 from evercal.recordings.frame import Frame, stated_grippers
 from evercal.robot.arm_offsets import ArmOffsets

@@ -14,11 +14,10 @@ from evercal.calibration.calibration import ErrorTerm
 from evercal.calibration.located import (
     Fused,
     ImagePose,
-    deviations,
     mean_covariance,
     poses_of,
 )
-from evercal.geometry import SE3, cross_matrix, pose_distance
+from evercal.geometry import SE3, cross_matrix, deviations, pose_distance
 from evercal.localization.estimate import Cause
 from evercal.typing import Array, IntArray
 

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evercal.calibration.located import ImagePose, length_mm_deg, poses_of
+from evercal.calibration.located import ImagePose, poses_of
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solution import PairSolution
 from evercal.calibration.pose_pairs.solve import solve_pose_pairs
 from evercal.errors import InputError
-from evercal.geometry import SE3
+from evercal.geometry import SE3, length_mm_deg
 
 LEAST_GRIPS = 5
 """Images that determine the camera and the grip; fewer show only that one of them moved."""

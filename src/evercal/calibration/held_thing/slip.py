@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evercal.calibration.located import length_mm_deg
 from evercal.errors import InputError
+from evercal.geometry import length_mm_deg
 from evercal.mapping.built_map import BuiltMap
 from evercal.recordings.frame import Frame
 from evercal.typing import Array

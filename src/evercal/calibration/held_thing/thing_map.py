@@ -7,8 +7,7 @@ from evercal.calibration.checks import LearnedChecks
 from evercal.calibration.from_map.hand_eye import HandEye
 from evercal.calibration.from_map.hand_eye_start import HandEyeStart
 from evercal.calibration.held_thing.windows import cropped, windows
-from evercal.calibration.located import deviations
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, deviations
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.frame import Frame, Recording
 
