@@ -38,16 +38,14 @@ class Bounds:
     """Text file."""
     nodes: int = 20_000
     """Values in a YAML file."""
-    elements: int = 200_000
-    """Links and joints of a URDF, and elements in them."""
+    joints: int = 100_000
+    """Links and joints of a URDF."""
     numbers: int = 10_000_000
     """Numbers of an array, and cells of a table."""
     recording_files: int = 200_000
     """Files of a recording at an address."""
     recording_bytes: int = 50 * 10**9
     """Bytes of these files."""
-    marker_bytes: int = 10_000_000
-    """Text at an address that is copied before the format is recognised."""
     pixels: int = 100_000_000
     """Pixels of an image."""
     aspect: int = 5

@@ -31,8 +31,7 @@ class InputError(Exception):
         text = str(message)
         if len(text) > _LONGEST:
             text = f"{text[:_LONGEST]} ..."
-        text = without_secrets(" ".join(text.splitlines()))
-        super().__init__(printable(text))
+        super().__init__(printable(without_secrets(" ".join(text.splitlines()))))
 
     @property
     def fields(self) -> tuple[str, ...]:

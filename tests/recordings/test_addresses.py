@@ -106,7 +106,7 @@ def test_outcomes_and_names_hold_no_secrets() -> None:
 
 @pytest.mark.parametrize(
     "address",
-    ["file://", "file:///", "memory://", "http://127.0.0.1:9", "http://h/?x=1"],
+    ["file://", "file:///", "memory://", "zip://", "s3:///"],
 )
 def test_an_address_without_a_path_is_refused(address: str) -> None:
     with pytest.raises(InputError, match="names no folder"), local_copy(address):

@@ -4,6 +4,7 @@ import dataclasses
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -132,6 +133,7 @@ class Learn(args.Verb):
                 "a network learns one recording of this machine; give one folder"
             )
         from evercal.map import Map
+        from evercal.recordings.load import format_of
 
         cell = Map.open(self.store, encoder=self.encoder)
         where = f"{self.workers} at once"
@@ -144,9 +146,11 @@ class Learn(args.Verb):
             def show(report: "LearnReport") -> None:
                 bars.write("\n".join(summary(report, self.store)))
 
+            read = partial(read_recording, self.reading)
+            vars(read)["check"] = format_of  # see `LearnTask.read`
             reports = cell.learn_many(
                 self.recordings,
-                read=_Reader(self.reading),
+                read=read,
                 workers=self.workers,
                 ray=self.ray,
                 results=self.results,
@@ -233,23 +237,6 @@ def read_recording(
         for warning in pictures.warnings:
             say(f"warning: {recording.name}: {warning}", sys.stderr)
     return recording
-
-
-@dataclass(frozen=True)
-class _Reader:
-    """Reads recordings in worker processes."""
-
-    reading: args.Reading
-
-    def __call__(self, path: Path) -> "Recording":
-        return read_recording(self.reading, path)
-
-    def check(self, path: Path) -> None:
-        """Refuse a folder of no known format, before its images are copied."""
-        from evercal.recordings.load import format_of
-
-        if self.reading.format is None:
-            format_of(path)
 
 
 def learn_into_networks(

@@ -22,7 +22,6 @@ from evercal.recordings import addresses, load_recording
 from evercal.recordings.addresses import RecordingAt
 from evercal.recordings.frame import Recording
 from evercal.recordings.held_out import named_recording
-from evercal.recordings.load import format_of
 
 _RESULT = "result"
 """Entry of a stored report: name of the file of results, which has the recording's digest."""
@@ -81,8 +80,6 @@ class LearnTask:
         if isinstance(source, Recording):
             return learn_scene(source, self.contents, self.memory, options=self.options)
         check = getattr(self.read, "check", Path)
-        if self.read is load_recording:
-            check = format_of
         with addresses.local_copy(source.address, check) as copy:
             return self._learn(named_recording(self.read(copy), source.name, ()))
 

@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Self
-from urllib.parse import urlsplit
 from uuid import uuid4
 
 from evercal.bounds import bounds, require_at_most
@@ -57,22 +56,21 @@ def local_copy(address: str, check: Check = Path) -> Iterator[Path]:
 
 
 def _copy(store: Any, root: str, target: Path, check: Check) -> None:
-    small = []
-    large = []
-    for file, size in _files(store, root).items():
-        inside = file.removeprefix(root).strip("/")
-        if ".." in inside.split("/"):
-            raise ValueError(f"its file {inside!r} leads out of it; rename it")
-        copy = target / inside  # target itself where the address is a file
+    sizes = _files(store, root)
+    copies = {file: target / file.removeprefix(root).strip("/") for file in sizes}
+    texts = []  # the copy is the target itself where the address is a file
+    for file, copy in copies.items():
+        if ".." in copy.parts:
+            raise ValueError(f"its file {file!r} leads out of it; rename it")
         copy.parent.mkdir(parents=True, exist_ok=True)
         copy.touch()
-        is_marker = copy.suffix in _TEXTS and size <= bounds().marker_bytes
-        (small if is_marker else large).append((file, copy, size))
-    for files in (small, large):
-        for file, copy, size in files:
-            store.get_file(file, str(copy))
-            if copy.stat().st_size < size:
-                raise ValueError(f"{copy.name} ended early; try again")
+        if copy.suffix in _TEXTS and sizes[file] <= bounds().text_bytes:
+            texts.append(file)
+    for files in (texts, copies.keys() - texts):
+        for file in files:
+            store.get_file(file, str(copies[file]))
+            if copies[file].stat().st_size < sizes[file]:
+                raise ValueError(f"{file} ended early; try again")
         check(target)
 
 
@@ -110,15 +108,11 @@ def _store(address: str) -> Iterator[tuple[Any, str]]:
     """The file system of an address, and the path in it; its errors name the address."""
     need = f"{address[:200]}: reading and writing it needs fsspec"
     fsspec = optional_module("fsspec", need, "ray")
+    if address.rstrip("/").endswith(":"):
+        raise InputError(f"{address}: names no folder, as in s3://bucket/room")
     with library_errors(f"{address}: cannot be read or written"):
         try:
-            store, root = fsspec.url_to_fs(address)
-            path = root
-            if "://" in root:  # HTTP keeps the host
-                path = urlsplit(root).path
-            if address.endswith("://") or not (path.strip("/") or "::" in address):
-                raise InputError(f"{address}: names no folder, as in s3://bucket/room")
-            yield store, root
+            yield fsspec.url_to_fs(address)
         except FileNotFoundError:
             raise InputError(
                 f"{address}: no such folder or file, or no answer"
@@ -147,8 +141,9 @@ def _files(store: Any, root: str) -> dict[str, int]:
                 folders.append(info["name"])
             else:
                 sizes[info["name"]] = info["size"] or 0
-        count = len(folders) + len(sizes)
-        require_at_most(count, "recording_files", "files at an address")
+        require_at_most(
+            len(folders) + len(sizes), "recording_files", "files at an address"
+        )
     require_at_most(sum(sizes.values()), "recording_bytes", "bytes at an address")
     if not sizes:
         raise FileNotFoundError(root)

@@ -137,3 +137,6 @@ def format_of(root: Path, stated: FormatName | None = None) -> FormatName:
         known = ", ".join(f"{entry.contents} ({key})" for key, entry in FORMATS.items())
         raise InputError(f"{root}: {what}; expected {known}")
     return format
+
+
+vars(load_recording)["check"] = format_of

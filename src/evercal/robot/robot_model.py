@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from evercal.bounds import require_at_most
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.robot.arm import Arm, MovingJoint
-from evercal.robot.urdf import Joint, read_urdf
+from evercal.robot.urdf import Joint, parsed_urdf
 from evercal.storage.text_files import named_errors, naming, refuse_repeated
 from evercal.typing import Array, PathLike
 
@@ -42,9 +43,10 @@ class RobotModel:
             raise InputError(
                 f"{path}: is a macro file; make a URDF of it with 'xacro' first"
             )
-        self.links, self._joints = read_urdf(self.path)
-        self._joint_named = {joint.name: joint for joint in self._joints}
         with named_errors(self.path, "URDF"), naming("no usable URDF"):
+            require_at_most(self.path.stat().st_size, "text_bytes", "bytes")
+            self.links, self._joints = parsed_urdf(self.path.read_bytes())
+            self._joint_named = {joint.name: joint for joint in self._joints}
             self._index_links()
 
     def _index_links(self) -> None:
@@ -65,10 +67,8 @@ class RobotModel:
 
     def rotates(self, name: str) -> bool:
         """Whether a joint exists and its values are angles."""
-        joint = self._joint_named.get(name)
-        if joint is None:
-            return False
-        return joint.type in ("revolute", "continuous")
+        named = self._joint_named
+        return name in named and named[name].type in ("revolute", "continuous")
 
     def chosen_links(self, base: str | None, gripper: str | None) -> tuple[str, str]:
         """Base and gripper link; if omitted, the root and the only end of the arm."""
@@ -96,19 +96,13 @@ class RobotModel:
         """
         base, gripper = self.chosen_links(base, gripper)
         arm = self.arm(base, gripper)
-        missing = []
-        columns = []
-        for name in arm.joints:
-            if name in names:
-                columns.append(list(names).index(name))
-            else:
-                missing.append(name)
+        missing = [name for name in arm.joints if name not in names]
         if missing:
             raise InputError(
                 f"{source}: no values for joint {', '.join(missing)}, which {gripper} depends on;"
                 f" given are {', '.join(names) or 'none'}"
             )
-        values = values[:, columns]
+        values = values[:, [names.index(name) for name in arm.joints]]
         notes = [
             f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
         ]
@@ -128,9 +122,7 @@ class RobotModel:
             )
         common = {*up} & {*down}
         steps = [(joint, True) for joint in up if joint not in common]
-        for joint in reversed(down):
-            if joint not in common:
-                steps.append((joint, False))
+        steps += [(joint, False) for joint in reversed(down) if joint not in common]
         names: dict[str, int] = {}
         chain: list[MovingJoint] = []
         before = np.eye(4)
@@ -179,11 +171,9 @@ class RobotModel:
         """(4, 4) parent_from_joint at the value zero."""
         if problem := joint.problem():
             raise self._error(joint, problem)
-        origin = np.eye(4)
-        turn = Rotation.from_euler("xyz", joint.numbers["origin rpy"])
-        origin[:3, :3] = turn.as_matrix()
-        origin[:3, 3] = joint.numbers["origin xyz"]
-        return origin
+        angles = Rotation.from_euler("xyz", joint.numbers["origin rpy"])
+        quaternion = angles.as_quat(scalar_first=True)
+        return SE3(quaternion, np.array(joint.numbers["origin xyz"])).matrix()
 
     def _axis(self, joint: Joint) -> Array:
         """(3,) unit vector."""

@@ -1,15 +1,14 @@
-"""`read_urdf`: links and joints of a URDF, by one strict reading of its XML."""
+"""`parsed_urdf`: links and joints of a URDF, by one strict reading of its XML."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from pathlib import Path
 from typing import NamedTuple
 from xml.parsers import expat
 
 from evercal.bounds import require_at_most
-from evercal.storage.text_files import named_errors, naming
+from evercal.storage.text_files import naming
 
 _ENDS = (
     "name",
@@ -28,8 +27,6 @@ _DEFAULTS = {
 }
 """Numbers of a joint, and what they are if they are omitted."""
 _KNOWN = {*_ENDS, *_DEFAULTS, "mimic joint"}
-_LIKENESS = 0.8
-"""Ratio of difflib from which a name is a misspelt one."""
 
 
 class Element(NamedTuple):
@@ -64,25 +61,17 @@ class Joint:
         if self.type == "fixed":
             missing &= {"origin xyz", "origin rpy"}
         for name in sorted(stated.keys() - _KNOWN):
-            for like in get_close_matches(name.lower(), sorted(missing), 1, _LIKENESS):
-                if ":" not in name:
-                    return f"has '{name}'; did you mean '{like}'?"
+            for like in get_close_matches(name.lower(), missing, 1, 0.8):
+                return f"has '{name}'; did you mean '{like}'?"
         return ""
 
 
-def read_urdf(path: Path) -> tuple[tuple[str, ...], tuple[Joint, ...]]:
-    """Read the names of links and the joints of a file, in its order; all else is skipped.
+def parsed_urdf(data: bytes) -> tuple[tuple[str, ...], tuple[Joint, ...]]:
+    """Names of links, and the joints, in the order of the file; all else is skipped.
 
     Raises:
-        InputError: It is no XML, or one of them is incomplete.
+        ValueError: It is no XML, or one of them is incomplete.
     """
-    with named_errors(path, "URDF"), naming("no usable URDF"):
-        require_at_most(path.stat().st_size, "text_bytes", "bytes")
-        return parsed_urdf(path.read_bytes())
-
-
-def parsed_urdf(data: bytes) -> tuple[tuple[str, ...], tuple[Joint, ...]]:
-    """Parse links and joints; ValueError as for `read_urdf`."""
     links = []
     joints = []
     for element in _elements(data):
@@ -104,21 +93,16 @@ def _elements(data: bytes) -> list[Element]:
     blank = len(data) - len(data.lstrip())
     above: list[str] = []
     elements: list[Element] = []
-    count = 0
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal count
         start = parser.CurrentByteIndex + blank
-        if not above and tag != "robot":
-            raise ValueError(f"it begins with <{tag}>, not with <robot>")
         if len(above) == 1 and tag in ("link", "joint"):
             elements.append(Element(tag, attributes, {tag: start}))
         elif len(above) == 2 and above[1] == "joint" and tag not in elements[-1].starts:
             elements[-1].starts[tag] = start
             for name, value in attributes.items():
                 elements[-1].stated[f"{tag} {name}"] = value
-        count += len(above) < 3
-        require_at_most(count, "elements", "links, joints and elements in them")
+        require_at_most(len(elements), "joints", "links and joints")
         above.append(tag)
 
     def refuse(*_: object) -> None:
@@ -143,12 +127,9 @@ def _joint(element: Element) -> Joint:
     for key, default in _DEFAULTS.items():
         text = element.stated.get(key, default)
         count = len(default.split())
-        try:
-            numbers[key] = [*map(float, text.split())]
-        except ValueError:
-            numbers[key] = []
+        numbers[key] = [*map(float, text.split())]
         finite = key.startswith("limit") or all(map(math.isfinite, numbers[key]))
         if len(numbers[key]) != count or not finite:
-            what = "three finite numbers" if count == 3 else "one finite number"
-            raise ValueError(f"'{text}' are not {what}")
+            words = ("one finite number", "three finite numbers")
+            raise ValueError(f"'{text}' are not {words[count > 1]}")
     return Joint(name, kind, parent, child, numbers, element)

@@ -151,9 +151,10 @@ def export_files(
         )
     try:
         content = exporter.write(export)
-        if isinstance(content, str) and export.stated:
-            is_tf = exporter.frame == "tf"
-            require_read_back(content, exporter.ending, export, is_tf)
+        if export.stated:
+            require_read_back(
+                str(content), exporter.ending, export, exporter.frame == "tf"
+            )
     except InputError as error:
         raise InputError(f"{key}: {error}") from None
     text = ""

@@ -16,18 +16,12 @@ import numpy as np
 from evercal.calibration.framed_pose import FramedPose
 from evercal.choices import Motors
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, pose_distance
-from evercal.recordings.poses.conventions import (
-    numbers_from_poses,
-    pose_convention,
-    poses_from_numbers,
-)
+from evercal.geometry import SE3, Camera
+from evercal.recordings.poses.conventions import numbers_from_poses, pose_convention
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.storage.text_files import read_text, yaml_documents
 from evercal.typing import Array, PathLike
 
-_ROUNDING = 1e-6
-"""Metres and radians, and share of a length."""
 PoseSource: TypeAlias = RobotPoses | PathLike | None
 
 # tf itself refuses only empty names and a leading slash; blanks, quotes and brackets would break
@@ -82,8 +76,8 @@ class Export:
     """camera_from_target of every image."""
     options: ExportOptions
     """All options, as given."""
-    stated: list[list[float]] = field(default_factory=list)
-    """Numbers of the pose that a writer took."""
+    stated: list[float] = field(default_factory=list)
+    """The last `numbers`."""
 
     @property
     def parent(self) -> str:
@@ -120,14 +114,9 @@ class Export:
         return f"{self.calibration.meaning}. Written by evercal."
 
     def numbers(self, convention: str = "xyzw") -> list[float]:
-        """The pose as numbers of a convention, which are converted back and compared."""
-        numbers = pose_numbers(self.pose, convention)
-        read = poses_from_numbers(numbers, pose_convention(convention))
-        most = _ROUNDING * (1 + np.linalg.norm(self.pose.translation_m))
-        if max(pose_distance(read, self.pose)) > most:
-            raise InputError(f"the pose as {convention} is another one; report this")
-        self.stated.append(numbers.tolist())
-        return self.stated[-1]
+        """The pose as numbers of a convention."""
+        self.stated[:] = pose_numbers(self.pose, convention).tolist()
+        return self.stated
 
 
 def pose_numbers(poses: SE3, convention: str = "xyzw") -> Array:

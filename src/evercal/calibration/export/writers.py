@@ -18,6 +18,10 @@ from evercal.calibration.export.request import Export, pose_numbers
 from evercal.errors import InputError
 from evercal.geometry import SE3
 
+_NUMBER_OF_OTHERS = re.compile(
+    r"(?<=: )(\d+[eE][-+]?\d+|\d+\.\d*[eE]\d+|0o[0-7]+)$", re.MULTILINE
+)
+"""Texts that are numbers in YAML 1.2, but not to PyYAML, which writes 1.0e-05."""
 _MOVE_GROUP = {"move_group_namespace": "/", "move_group": "manipulator"}
 
 
@@ -115,23 +119,9 @@ yaskawa = _text("yaskawa", "# {comment}\nX Y Z Rx Ry Rz\n{} {} {} {} {} {}\n", _
 staubli = _text("staubli", "# {comment}\nX Y Z RX RY RZ\n{} {} {} {} {} {}\n", _nine)
 
 
-class _Dumper(yaml.SafeDumper):
-    """Quotes texts with digits, as 1e5 and 0o17 are numbers to some readers."""
-
-    def represent_str(self, data: str) -> yaml.ScalarNode:
-        node = super().represent_str(data)
-        if re.search(r"\d", data):
-            node.style = '"'
-        return node
-
-
-_Dumper.add_representer(str, _Dumper.represent_str)
-
-
 def _yaml(record: object, flow: bool | None = False, width: int = 80) -> str:
-    return yaml.dump(
-        record, Dumper=_Dumper, sort_keys=False, default_flow_style=flow, width=width
-    )
+    text = yaml.safe_dump(record, sort_keys=False, default_flow_style=flow, width=width)
+    return _NUMBER_OF_OTHERS.sub(r'"\1"', text)
 
 
 def stamped(export: Export) -> str:

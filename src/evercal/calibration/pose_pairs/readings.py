@@ -133,8 +133,8 @@ def shifted(pairs: PosePairs, mount: MountName) -> list[Reading]:
 
 def _extra_row(poses: SE3, other: SE3) -> int:
     """Row of `poses` without which their successive angles fit those of the other poses best."""
-    turned = _steps_rad(poses)
-    same = _steps_rad(other)
+    turned = steps_rad(poses)
+    same = steps_rad(other)
     before = np.abs(turned - same)
     after = np.abs(turned[1:] - same[:-1])
     means = []
@@ -143,7 +143,8 @@ def _extra_row(poses: SE3, other: SE3) -> int:
     return int(np.argmin(means))
 
 
-def _steps_rad(poses: SE3) -> Array:
+def steps_rad(poses: SE3) -> Array:
+    """(n - 1,) angles between successive poses."""
     return pose_distance(poses[:-1], poses[1:])[1]
 
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
+from evercal.calibration.pose_pairs.readings import steps_rad
 from evercal.calibration.pose_pairs.solve import solve_pose_pairs
 from evercal.errors import InputError
-from evercal.geometry import SE3, pose_distance
+from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.robot.mount import MountName
 from evercal.typing import Array, BoolArray
@@ -143,7 +144,7 @@ def _coarse_offset(
     """Return the offset on a grid at which robot and camera rotate by the same angles."""
     order = np.argsort(camera.stamps_s)
     stamps = np.asarray(camera.stamps_s[order], dtype=np.float64)
-    angles = _angles(camera.camera_from_board[order])
+    angles = steps_rad(camera.camera_from_board[order])
     best = (np.inf, 0.0)
     for offset in np.arange(
         -largest_s,
@@ -155,7 +156,7 @@ def _coarse_offset(
         if overlapping.sum() < max(3, 0.5 * len(overlapping)):
             continue
         # An outlier spoils two angles, so the worst quarter is ignored.
-        error = np.sort(np.abs(_angles(poses) - angles)[overlapping])
+        error = np.sort(np.abs(steps_rad(poses) - angles)[overlapping])
         cost = float(error[: max(3, (3 * len(error)) // 4)].mean())
         best = min(best, (cost, float(offset)))
     if not np.isfinite(best[0]):
@@ -165,7 +166,3 @@ def _coarse_offset(
             f" {robot.stamps_s[-1]:.3f} s; check that both use the same clock"
         )
     return best[1]
-
-
-def _angles(poses: SE3) -> Array:
-    return pose_distance(poses[:-1], poses[1:])[1]

@@ -203,7 +203,7 @@ def add_arm(
     The node `gripper` moves with the first of `links` that the arm has.
     """
     model = RobotModel(path)  # reports what is wrong in the file
-    optional_module("yourdfpy", f"{path}: drawing an arm needs yourdfpy", "urdf")
+    optional_module("yourdfpy", "drawing an arm needs yourdfpy", "urdf")
     from viser.extras import ViserUrdf
 
     link = next((link for link in links if link in model.links), None)
