@@ -26,7 +26,11 @@ _DEFAULTS = {
     "limit upper": "inf",
 }
 """Numbers of a joint, and what they are if they are omitted."""
-_KNOWN = {*_ENDS, *_DEFAULTS, "mimic joint"}
+_KNOWN = {
+    *_ENDS,
+    *_DEFAULTS,
+    "mimic joint",
+}
 
 
 class Element(NamedTuple):
@@ -59,7 +63,10 @@ class Joint:
             return "is turned by quat_xyzw, which most programs ignore; write rpy"
         missing = _KNOWN - stated.keys()
         if self.type == "fixed":
-            missing &= {"origin xyz", "origin rpy"}
+            missing &= {
+                "origin xyz",
+                "origin rpy",
+            }
         for name in sorted(stated.keys() - _KNOWN):
             for like in get_close_matches(name.lower(), missing, 1, 0.8):
                 return f"has '{name}'; did you mean '{like}'?"
@@ -130,6 +137,9 @@ def _joint(element: Element) -> Joint:
         numbers[key] = [*map(float, text.split())]
         finite = key.startswith("limit") or all(map(math.isfinite, numbers[key]))
         if len(numbers[key]) != count or not finite:
-            words = ("one finite number", "three finite numbers")
+            words = (
+                "one finite number",
+                "three finite numbers",
+            )
             raise ValueError(f"'{text}' are not {words[count > 1]}")
     return Joint(name, kind, parent, child, numbers, element)
