@@ -212,6 +212,8 @@ def test_undo_does_not_bring_back_an_earlier_base_frame(
     store.update(replace(scenes[0], frame=frame))  # aligned after the refresh
     with pytest.raises(InputError, match="no refresh to undo"):
         store.undo(scenes[0].name)
+    with pytest.raises(InputError, match=f"'attic': store .* has {scenes[0].name}"):
+        store.undo("attic")
     (stored,) = MapStore.open(tmp_path / "store").contents.scenes
     assert stored.frame.base_covariance is not None
     assert verify(tmp_path / "store") == []

@@ -21,6 +21,7 @@ from evercal.errors import InputError
 from evercal.storage.archive import (
     check_archive,
     extract_archive,
+    read_entry,
     write_archive,
 )
 
@@ -54,6 +55,24 @@ def test_round_trip_gives_the_same_files_and_bytes(
     assert sorted(check_archive(one)) == sorted(FILES)
     write_archive(two, tmp_path / "out", FILES)
     assert two.read_bytes() == one.read_bytes()
+
+
+def test_folders_of_other_programs_are_made_in_any_order(tmp_path: Path) -> None:
+    entries = [("a/b/", b""), ("a/b/c.txt", b"text"), ("a/", b""), ("d/", b"")]
+    extract_archive(zipped(tmp_path / "x.zip", *entries), tmp_path / "out")
+    made = [
+        path.relative_to(tmp_path / "out").as_posix()
+        for path in (tmp_path / "out").rglob("*")
+    ]
+    assert sorted(made) == ["a", "a/b", "a/b/c.txt", "d"]
+    assert (tmp_path / "out" / "a" / "b" / "c.txt").read_bytes() == b"text"
+
+
+def test_an_entry_is_read_alone_up_to_a_bound(folder: Path, tmp_path: Path) -> None:
+    write_archive(tmp_path / "x.zip", folder, FILES)
+    assert read_entry(tmp_path / "x.zip", "a.txt", 5) == b"first"
+    with pytest.raises(InputError, match=r"a\.txt has 5 bytes, at most 4"):
+        read_entry(tmp_path / "x.zip", "a.txt", 4)
 
 
 def test_a_missing_file_leaves_the_old_archive(folder: Path, tmp_path: Path) -> None:
