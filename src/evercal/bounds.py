@@ -38,8 +38,8 @@ class Bounds:
     """Text file."""
     nodes: int = 20_000
     """Values in a YAML file."""
-    joints: int = 100_000
-    """Links and joints of a URDF."""
+    elements: int = 500_000
+    """Elements of a URDF; a chain of 20,000 links has 140,000."""
     numbers: int = 10_000_000
     """Numbers of an array, and cells of a table."""
     recording_files: int = 200_000

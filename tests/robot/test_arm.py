@@ -348,8 +348,8 @@ def test_a_chain_of_many_links_takes_time_in_proportion(
 
     chain(100)
     assert chain(8_000) < 20 * chain(1_000)
-    monkeypatch.setenv("EVERCAL_LIMITS", "joints=100")
-    refused("links and joints, at most 100", chain, 1_000)
+    monkeypatch.setenv("EVERCAL_LIMITS", "elements=100")
+    refused("elements in XML, at most 100", chain, 1_000)
 
 
 def test_a_urdf_that_was_cut_off_is_refused(tmp_path: Path) -> None:

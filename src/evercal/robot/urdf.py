@@ -100,8 +100,12 @@ def _elements(data: bytes) -> list[Element]:
     blank = len(data) - len(data.lstrip())
     above: list[str] = []
     elements: list[Element] = []
+    count = 0
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal count
+        count += 1
+        require_at_most(count, "elements", "elements in XML")
         start = parser.CurrentByteIndex + blank
         if len(above) == 1 and tag in ("link", "joint"):
             elements.append(Element(tag, attributes, {tag: start}))
@@ -109,7 +113,6 @@ def _elements(data: bytes) -> list[Element]:
             elements[-1].starts[tag] = start
             for name, value in attributes.items():
                 elements[-1].stated[f"{tag} {name}"] = value
-        require_at_most(len(elements), "joints", "links and joints")
         above.append(tag)
 
     def refuse(*_: object) -> None:
