@@ -92,6 +92,21 @@ def test_a_folder_that_is_away_for_a_moment_is_a_fault(serve, copy, image, caplo
             assert service.get("/health").json == {"status": "ok", "scenes": 1}
 
 
+def test_a_folder_that_vanishes_while_it_is_opened(copy, monkeypatch):
+    live = LiveMap(copy)
+    Map.open(copy).rename("hall", "lobby")
+    opened = Map.open
+
+    def away(path):
+        copy.rename(copy.parent / "aside")
+        return opened(path)
+
+    monkeypatch.setattr(Map, "open", away)
+    assert live.refresh()
+    assert live.current.scenes == ("hall",)
+    assert "no such folder" in str(live.fault)
+
+
 def test_a_folder_that_vanishes_before_its_first_scene(serve, tmp_path, image):
     folder = tmp_path / "map"
     folder.mkdir()

@@ -12,6 +12,7 @@ import numpy as np
 from evercal.errors import InputError, UnavailableError
 from evercal.localization.localizer import Localizer
 from evercal.map import Map
+from evercal.mapping.store import MapStore
 from evercal.storage.manifest import MANIFEST, read_manifest
 
 _PROBED = 20
@@ -83,6 +84,8 @@ class LiveMap:
         self._most_found = len(self._stamp)
         try:
             opened = Map.open(self._path)
+            if not opened.scenes and len(self._stamp) > 1:
+                opened = Map(MapStore.open(self._path))  # or it is away by now
             if opened.scenes:
                 _probe(opened.localizer, read_manifest(self._path)["stages"])
         except InputError:
