@@ -22,7 +22,9 @@ def run(
     seconds: float = 60.0,
     out: Path = Path("runs/serve_streams.csv"),
 ) -> None:
-    """Send the frames of a recording, forwards and backwards, with a client's own keepalive.
+    """Send the frames of a recording, forwards and backwards.
+
+    The client sets no deadline for its pings, which are answered after the frames before them.
 
     Args:
         store: Folder for a new map.
@@ -55,12 +57,12 @@ def _row(service: Service, frames: list[bytes], rate: float, words: str) -> Row:
     delays = []
     waiting = []
     lost = 0
-    with connect(url) as socket:
+    with connect(url, ping_timeout=None) as socket:
         sending = threading.Thread(target=_send, args=(socket, frames, rate, times))
         sending.start()
         number = -1
         while number < len(frames) - 1:
-            row = json.loads(socket.recv(60))
+            row = json.loads(socket.recv(300))
             # Frames that were dropped are stated, and all others are answered in order.
             lost += row["frame"] - number - 1 - row["dropped"]
             number = row["frame"]
