@@ -34,7 +34,7 @@ class Flaky(MemoryFileSystem):
     dead = False
 
     @classmethod
-    def _strip_protocol(cls, path: str) -> str:
+    def _strip_protocol(cls, path: str) -> Any:
         return super()._strip_protocol(path.replace("flaky://", "/"))
 
     def _answer(self) -> None:
@@ -42,13 +42,13 @@ class Flaky(MemoryFileSystem):
             self.dead = True
             raise ConnectionResetError("connection lost to user:SECRET")
 
-    def get_file(self, rpath: str, lpath: str, **options: Any) -> None:
+    def get_file(self, *paths: Any, **options: Any) -> None:
         self._answer()
-        Flaky.fetched.append(rpath)
-        super().get_file(rpath, lpath, **options)
+        Flaky.fetched.append(paths[0])
+        super().get_file(*paths, **options)
 
-    def put_file(self, lpath: str, rpath: str, **options: Any) -> None:
-        super().put_file(lpath, rpath, **options)
+    def put_file(self, *paths: Any, **options: Any) -> None:
+        super().put_file(*paths, **options)
         self._answer()
 
 

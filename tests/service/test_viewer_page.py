@@ -113,8 +113,9 @@ def test_a_bad_file_is_named(localizer, tmp_path):
 def test_drawing_an_arm_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "yourdfpy", None)
     (tmp_path / "arm.urdf").write_text(ARM)
+    node: Any = None
     with pytest.raises(InputError, match=r"constraints.txt '\.\[urdf\]'"):
-        add_arm(None, tmp_path / "arm.urdf", None, [])
+        add_arm(node, tmp_path / "arm.urdf", node, [])
 
 
 def test_the_gripper_follows_the_joints(tmp_path):
