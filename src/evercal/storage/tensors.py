@@ -1,13 +1,14 @@
 """Named arrays in safetensors files."""
 
 import errno
+import io
 import json
 import os
-import resource
 import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -66,8 +67,9 @@ class _OpenFile:
 
     def __init__(self, path: Path):
         self.path = path
-        self._descriptor = _descriptor(path)
-        weakref.finalize(self, os.close, self._descriptor)
+        self._file = _opened(path)
+        weakref.finalize(self, self._file.close)
+        self._lock = Lock()
         self._opened = self._state()
         self.bytes, _ = self._opened
 
@@ -75,9 +77,10 @@ class _OpenFile:
         """Bytes from an offset on."""
         content = np.empty(count, np.uint8)
         left = content.data
-        while left and (arrived := os.preadv(self._descriptor, [left], start)):
-            start += arrived
-            left = left[arrived:]
+        with self._lock:
+            self._file.seek(start)
+            while left and (arrived := self._file.readinto(left)):
+                left = left[arrived:]
         if left or self._state() != self._opened:
             raise ValueError(
                 "it is too short, or was overwritten in place while it was open; replace a map by"
@@ -86,7 +89,7 @@ class _OpenFile:
         return content
 
     def _state(self) -> tuple[int, int]:
-        status = os.fstat(self._descriptor)
+        status = os.fstat(self._file.fileno())
         return status.st_size, status.st_mtime_ns
 
 
@@ -134,16 +137,18 @@ def open_tensors(path: Path) -> dict[str, StoredRows]:
         return arrays
 
 
-def _descriptor(path: Path) -> int:
+def _opened(path: Path) -> io.FileIO:
     try:
-        return os.open(path, os.O_RDONLY)
+        return path.open("rb", buffering=0)
     except OSError as error:
         if error.errno != errno.EMFILE:
             raise
+    import resource  # not on every system
+
     # A map has as many files as scenes.
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
-    return os.open(path, os.O_RDONLY)
+    return path.open("rb", buffering=0)
 
 
 @contextmanager
