@@ -79,9 +79,9 @@ ARRAYS: dict[str, Callable[[Arrays], object]] = {
         cells=np.array([47, 49]),
     ),
     "a scene has landmarks": without_landmarks,
-    "landmarks outside": lambda a: a["landmark_pixels"].fill(64),
-    "landmarks without": lambda a: a["landmark_sigma"].fill(0),
-    "landmarks without depth": lambda a: a["landmark_inverse_depth"].fill(-1),
+    "landmarks lie in their images": lambda a: a["landmark_pixels"].fill(64),
+    "landmarks have depths": lambda a: a["landmark_sigma"].fill(0),
+    "landmarks have dept": lambda a: a["landmark_inverse_depth"].fill(-1),
 }
 SCENES: dict[str, Callable[[dict[str, Any]], object]] = {
     "camera .1000000000x48": lambda s: s["camera"].update(width=10**9),

@@ -1,16 +1,38 @@
 """Whether a stored scene is one: right checksums say only that a file is what somebody wrote."""
 
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from evercal.bounds import bounds, require_image_size
+from evercal.bounds import TooLargeError, bounds, require_image_size
+from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.features.vlad import WIDTH
+from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import size_in_header
+
+
+@contextmanager
+def of_evercal(folder: Path) -> Iterator[None]:
+    """Turn errors while the folder of a scene is read into an `InputError` that names it."""
+    try:
+        yield
+    except TooLargeError as error:
+        raise InputError(f"{folder}: {error}") from None
+    except (InputError, OSError):
+        raise
+    except Exception as error:
+        # Nothing is assumed about what another program has written.
+        reason = " ".join(repr(error).split())[:200]
+        raise InputError(
+            f"{folder}: not a scene that evercal wrote ({reason})"
+        ) from None
 
 
 def require_consistent(scene: SceneMap) -> None:
@@ -24,7 +46,6 @@ def require_consistent(scene: SceneMap) -> None:
     _require_finite("descriptors", descriptors)
     _require_frame(scene.frame)
     _require(scene.train_frames > 0, "a scene has training frames")
-    _require(scene.landmarks > 0, "a scene has landmarks")
     counts = {
         len(keyframes.images),
         len(keyframes.cameras),
@@ -50,11 +71,32 @@ def require_of_encoder(scene: SceneMap, encoder: Encoder, short_side: int) -> No
         small = camera.short_side_resized(short_side)
         columns = small.width // encoder.stride
         rows = small.height // encoder.stride
-        depths = len(keyframes.inverse_depth[i])
+        depths = keyframes.inverse_depth[i]
         _require(
-            depths == rows * columns,
-            f"keyframe {i}: {depths} depths of {rows}x{columns} cells",
+            len(depths) == rows * columns,
+            f"keyframe {i}: {len(depths)} depths of {rows}x{columns} cells",
         )
+        _require((depths > 0).any(), f"keyframe {i}: no depths")
+
+
+def require_landmarks(arrays: Mapping[str, Any], cameras: Sequence[Camera]) -> None:
+    """Raise ValueError for stored landmarks outside their images, or without depth.
+
+    `arrays` are those of `Keyframes.to_tensors`.
+    """
+    counts = arrays["landmark_counts"][:]
+    pixels = arrays["landmark_pixels"][:]
+    depths = np.minimum(
+        arrays["landmark_inverse_depth"][:], arrays["landmark_sigma"][:]
+    )
+    sides = [(camera.width, camera.height) for camera in cameras]
+    size = np.repeat(np.array(sides, np.int32), counts, axis=0)
+    _require(len(pixels), "a scene has landmarks")
+    _require((pixels >= 0).all(), "landmarks lie in their images")
+    _require((pixels < size).all(), "landmarks lie in their images")
+    _require((depths > 0).all(), "landmarks have depths")
+    for name in ("inverse_depth", "sigma", "slope"):
+        _require_finite("landmarks", arrays[f"landmark_{name}"][:])
 
 
 def _require_keyframe(keyframes: Keyframes, i: int) -> None:
@@ -67,17 +109,6 @@ def _require_keyframe(keyframes: Keyframes, i: int) -> None:
     image = np.frombuffer(keyframes.images[i], np.uint8)
     stated = size_in_header(image)
     _require(stated == size, f"{name}: {stated} pixels, its camera {size}")
-    marks = keyframes.landmarks[i]
-    inside = (marks.pixels >= 0) & (marks.pixels < size)
-    positive = np.minimum(marks.inverse_depth, marks.sigma) > 0
-    _require(inside.all(), f"{name}: landmarks outside the image")
-    _require(positive.all(), f"{name}: landmarks without depth")
-    _require_finite(
-        f"{name}: landmarks",
-        marks.inverse_depth,
-        marks.sigma,
-        marks.slope,
-    )
 
 
 def _require_frame(frame: MapFrame) -> None:

@@ -24,13 +24,24 @@ from evercal.typing import IntArray
 JPEG_QUALITY = 95
 """Quality of stored images, percent."""
 Part = TypeVar("Part")
-_LANDMARK_FIELDS = {
-    "pixels": np.int16,
-    "inverse_depth": np.float32,
-    "slope": np.float32,
-    "sigma": np.float32,
+_LANDMARK_FIELDS = ("pixels", "inverse_depth", "slope", "sigma")
+"""Fields of `Landmarks`, in order; 20 bytes a landmark."""
+_STORED = {
+    "images": (np.uint8, ()),
+    "lengths": (np.int64, ()),
+    "cameras": (np.float64, (14,)),
+    "distortion": (np.int64, ()),
+    "poses": (np.float64, (7,)),
+    "inverse_depth": (np.float16, ()),
+    "cells": (np.int64, ()),
+    "descriptors": (np.float16, None),
+    "landmark_counts": (np.int64, ()),
+    "landmark_pixels": (np.int16, (2,)),
+    "landmark_inverse_depth": (np.float32, ()),
+    "landmark_slope": (np.float32, (2,)),
+    "landmark_sigma": (np.float32, ()),
 }
-"""Fields of `Landmarks`, in order, and how they are stored: 20 bytes a landmark."""
+"""Type of the numbers of each stored array, and shape of its rows."""
 
 
 @dataclass(frozen=True)
@@ -140,9 +151,11 @@ class Keyframes:
             tensors["descriptors"] = self.descriptors
         if self.landmarks:
             tensors["landmark_counts"] = _lengths(self.landmarks)
-            for name, kind in _LANDMARK_FIELDS.items():
-                values = [getattr(marks, name) for marks in self.landmarks]
-                tensors[f"landmark_{name}"] = np.concatenate(values).astype(kind)
+            for field in _LANDMARK_FIELDS:
+                values = [getattr(marks, field) for marks in self.landmarks]
+                name = f"landmark_{field}"
+                kind, _ = _STORED[name]
+                tensors[name] = np.concatenate(values).astype(kind)
         return tensors
 
     @classmethod
@@ -152,6 +165,10 @@ class Keyframes:
         Arrays of `storage.tensors.open_tensors` stay in their file: images, depths and landmarks
         are read when they are used, so that processes share the memory.
         """
+        for name, array in tensors.items():
+            kind, row = _STORED[name]
+            if array.dtype != kind or row not in (None, array.shape[1:]):
+                raise ValueError(f"{name} is {array.dtype}, {array.shape}")
         cameras = []
         counts = tensors["distortion"][:].tolist()
         for row, count in zip(tensors["cameras"][:].tolist(), counts, strict=True):

@@ -91,7 +91,8 @@ def project_surface(
     inside &= (v > BORDER_PX) & (v < camera.height - BORDER_PX - 1)
     visible = np.flatnonzero(inside)
     pixels = np.stack([u[visible], v[visible]], 1)
-    beside = rotation @ points[1:, visible].transpose(0, 2, 1) + translation_m[:, None]
+    columns = points[1:, visible].transpose(0, 2, 1)
+    beside = rotation @ columns + translation_m[:, None]
     depth = beside[:, 2]
     np.maximum(depth, NEAREST_M, out=depth)
     tangents = camera.project(beside.transpose(0, 2, 1)) - pixels
@@ -161,4 +162,5 @@ def slopes(
         ksize=3,
         scale=1 / 8,
     )
-    return np.stack([right, down], -1).reshape(-1, 2).astype(np.float64) / cell_px
+    pixels = np.stack([right, down], -1).reshape(-1, 2)
+    return pixels.astype(np.float64) / cell_px

@@ -233,7 +233,8 @@ def _left_out(
     radius: tuple[float, float],
 ) -> Array:
     """(n, 6) corrections that the other frames predict."""
-    weight = np.stack([_closeness(poses, poses[i], radius) for i in range(len(poses))])
+    rows = [_closeness(poses, pose, radius) for pose in poses]
+    weight = np.stack(rows)
     np.fill_diagonal(weight, 0)
     return weight @ correction / (weight.sum(1, keepdims=True) + SHRINKAGE)
 

@@ -9,19 +9,23 @@ stages/0001-NAME/
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.bounds import TooLargeError, bounds
+from evercal.bounds import bounds
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder, Features, load_encoder
 from evercal.geometry import SE3, Camera, pose_to_dict
-from evercal.mapping.consistency import require_consistent, require_of_encoder
+from evercal.mapping.consistency import (
+    of_evercal,
+    require_consistent,
+    require_landmarks,
+    require_of_encoder,
+)
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity
 from evercal.mapping.scene_map import MapContents, SceneMap
@@ -83,7 +87,7 @@ class MapStore(StageStore[MapContents]):
             store = cls(root, contents, stages, (first, *centroids))
             contents.scenes = read_scenes(root, manifest)
             for name, scene in zip(stages, contents.scenes, strict=True):
-                with _of_evercal(store.folder(name)):
+                with of_evercal(store.folder(name)):
                     require_of_encoder(scene, local, contents.short_side)
             return store
 
@@ -281,26 +285,10 @@ def read_scenes(root: Path, manifest: Manifest) -> list[SceneMap]:
 
 def read_scene(folder: Path) -> SceneMap:
     """Read a scene from its folder, and check that its parts agree."""
-    with _of_evercal(folder):
+    with of_evercal(folder):
         scene = _read_scene(folder)
         require_consistent(scene)
         return scene
-
-
-@contextmanager
-def _of_evercal(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except TooLargeError as error:
-        raise InputError(f"{folder}: {error}") from None
-    except (InputError, OSError):
-        raise
-    except Exception as error:
-        # Nothing is assumed about what another program has written.
-        reason = " ".join(repr(error).split())[:200]
-        raise InputError(
-            f"{folder}: not a scene that evercal wrote ({reason})"
-        ) from None
 
 
 def _read_scene(folder: Path) -> SceneMap:
@@ -313,11 +301,14 @@ def _read_scene(folder: Path) -> SceneMap:
     if not content.get("metric", True):
         unit = content.get("unit", 1.0)
     focal, centre, distortion = content.get("intrinsics_sigma", (0, 0, 0))
+    arrays = open_tensors(folder / KEYFRAMES)
+    keyframes = Keyframes.from_tensors(arrays)
+    require_landmarks(arrays, keyframes.cameras)
     return SceneMap(
         name=checked_name(content["name"]),
         camera=Camera.from_dict(content["camera"]),
         adjusted_camera=Camera.from_dict(content["adjusted_camera"]),
-        keyframes=Keyframes.from_tensors(open_tensors(folder / KEYFRAMES)),
+        keyframes=keyframes,
         frame=frame_of(content["frame"], correction),
         train_frames=content["train_frames"],
         intrinsics_sigma=(float(focal), float(centre), float(distortion)),

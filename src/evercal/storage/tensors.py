@@ -100,6 +100,8 @@ class StoredRows:
         self._file = file
         self._start = start
         self._like = like
+        self.dtype = like.dtype
+        self.shape = like.shape
 
     def __len__(self) -> int:
         return len(self._like)
