@@ -179,9 +179,6 @@ def test_a_file_that_is_overwritten_in_place_heals(serve, copy, image):
     (file,) = copy.glob("stages/*/keyframes.safetensors")
     content = file.read_bytes()
     with serve(copy) as service:
-        live = service.service.live
-        # Other keyframes than that of the probe are not read yet.
-        live.current.localizer.poses.bank._loaded.clear()
         file.write_bytes(content[:2000])
         got = service.post("/localize", image=image)
         assert got.status == 503

@@ -7,12 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import pytest
 from websockets.sync.client import connect
 
-from evercal import Client, InputError, Map
 from evercal.bounds import RequestBounds
-from evercal.recordings import read_image
 
 from .test_guard import wait_until_closed
 
@@ -89,27 +86,3 @@ def test_intrinsics_are_of_the_frames_that_follow(hall_service, image, hall):
         rows = [json.loads(socket.recv(60)) for _ in range(4)]
     assert ["error" in row for row in rows] == [False, True, False, True]
     assert [row["frame"] for row in rows] == [0, 1, 2, 3]
-
-
-def test_frames_of_a_client(hall_service, hall_store, image, hall):
-    client = Client(hall_service.url)
-    pixels = read_image(image)
-    expected: Any = Map.open(hall_store).localize(pixels)
-    for newest in (False, True):
-        frames = [image, pixels, str(image), pixels]
-        located = list(client.track(frames, camera=hall.test[7].camera, newest=newest))
-        assert len(located) + sum(frame.dropped for frame in located) == 4
-        assert located[-1].number == 3
-        assert located[0].state == "relocalized"
-        got: Any = located[-1].estimate
-        assert got.scene == "hall"
-        apart = got.base_from_camera.translation_m
-        apart = apart - expected.base_from_camera.translation_m
-        assert abs(apart).max() < 0.002
-    assert list(client.track([])) == []
-    with pytest.raises(InputError, match=r"gone\.png: cannot be read"):
-        list(client.track([image, "gone.png"]))
-    with pytest.raises(InputError, match="frame 0: not a readable image"):
-        list(client.track([__file__]))
-    with pytest.raises(InputError, match=r"127\.0\.0\.1:1: no answer"):
-        list(Client("http://127.0.0.1:1").track([image]))

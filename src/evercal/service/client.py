@@ -2,9 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +13,6 @@ from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.errors import InputError, missing_extra
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
-from evercal.localization.tracking import TrackedFrame
 from evercal.recordings.images import as_rgb
 from evercal.robot.mount import MountName
 from evercal.typing import PathLike
@@ -28,16 +25,6 @@ Part = tuple[str, bytes]
 """File name and content."""
 Parts = list[tuple[str, Part | str]]
 """Parts of a request by name."""
-
-
-@dataclass(frozen=True, eq=False)
-class StreamedFrame(TrackedFrame):
-    """A frame of a stream that a service has located; its number is that of the frame sent."""
-
-    waiting: int = 0
-    """Frames that wait in the service behind this one."""
-    dropped: int = 0
-    """Frames before this one that were dropped, see `Client.track`."""
 
 
 class Client:
@@ -60,8 +47,6 @@ class Client:
             raise missing_extra("a client needs urllib3", "serve") from None
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         self._url = url.rstrip("/")
-        self._headers = headers
-        self._timeout = timeout
         retries = urllib3.Retry(
             connect=2, read=0, redirect=0, status=0, other=0, backoff_factor=0.1
         )
@@ -86,55 +71,6 @@ class Client:
             *_json_part("camera", camera),
         ]
         return _estimate(self._ask("POST", "/localize", parts))
-
-    def track(
-        self,
-        frames: Iterable[np.ndarray | PathLike],
-        *,
-        camera: Camera | None = None,
-        newest: bool = False,
-    ) -> Iterator[StreamedFrame]:
-        """Locate the frames of one camera in order, see `Map.track`.
-
-        Each frame is sent when it comes; answers that have arrived until then are returned first.
-
-        Args:
-            frames: Images; they are sent as those of `localize` are.
-            camera: Intrinsics. Default: those of the camera that recorded the scene.
-            newest: Of the frames that wait in the service, drop all but the newest.
-
-        Yields:
-            State and answer of each frame that was not dropped.
-        """
-        from websockets.exceptions import WebSocketException
-        from websockets.sync.client import connect
-
-        url = self._url.replace("http", "ws", 1) + "/track" + "?newest=1" * newest
-        try:
-            # Pings are answered after the frames that were sent before them.
-            with connect(
-                url,
-                additional_headers=self._headers,
-                open_timeout=self._timeout,
-                ping_timeout=None,
-                max_queue=None,
-            ) as socket:
-                if camera is not None:
-                    socket.send(json.dumps(camera.to_dict()))
-                left = 0
-                for image in frames:
-                    socket.send(_image_part(image, "")[1])
-                    left += 1
-                    with suppress(TimeoutError):
-                        while left:
-                            yield (frame := _streamed(socket.recv(0.0)))
-                            left -= 1 + frame.dropped
-                while left:
-                    yield (frame := _streamed(socket.recv(self._timeout)))
-                    left -= 1 + frame.dropped
-        except (OSError, WebSocketException) as error:
-            reason = " ".join(str(error).split())
-            raise InputError(f"{self._url}: no answer ({reason[:200]})") from None
 
     def calibrate(
         self,
@@ -191,20 +127,6 @@ class Client:
         if isinstance(content, dict):
             message = content.get("error") or message
         raise InputError(message)
-
-
-def _streamed(answer: str | bytes) -> StreamedFrame:
-    row = json.loads(answer)
-    if "error" in row:
-        raise InputError(row["error"])
-    return StreamedFrame(
-        row["frame"],
-        row["stamp_s"],
-        row["state"],
-        _estimate(row),
-        waiting=row["waiting"],
-        dropped=row["dropped"],
-    )
 
 
 def _image_part(image: np.ndarray | PathLike, name: str) -> Part:

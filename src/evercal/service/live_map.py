@@ -7,16 +7,12 @@ import threading
 import time
 from pathlib import Path
 
-import numpy as np
-
 from evercal.errors import InputError, UnavailableError
 from evercal.localization.localizer import Localizer
 from evercal.map import Map
 from evercal.mapping.store import MapStore
-from evercal.storage.manifest import MANIFEST, read_manifest
+from evercal.storage.manifest import MANIFEST
 
-_PROBED = 20
-"""Scenes that are tried before a state is served; each takes as long as an image."""
 _PAUSE_S = 5.0
 """Time until a state that could not be served is tried again, seconds."""
 
@@ -26,7 +22,7 @@ class LiveMap:
 
     A request takes `localizer` once and answers from it, so that no answer mixes two states. The
     folder may be missing until a first scene is learned. What was there once and is gone is a
-    fault, and so is a map that cannot locate its own keyframes.
+    fault, and so is a map whose contents contradict each other.
 
     Args:
         path: Folder of the map.
@@ -87,23 +83,13 @@ class LiveMap:
             if not opened.scenes and len(self._stamp) > 1:
                 opened = Map(MapStore.open(self._path))  # or it is away by now
             if opened.scenes:
-                _probe(opened.localizer, read_manifest(self._path)["stages"])
+                _ = opened.localizer  # loaded before requests wait for it
         except InputError:
             raise
         except Exception as error:
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise InputError(f"{self._path}: cannot be used ({reason})") from error
         return opened
-
-
-def _probe(localizer: Localizer, stages: list[str]) -> None:
-    """Locate a keyframe of each scene that was changed last."""
-    numbers = range(min(len(localizer.scenes), len(stages)))
-    changed = sorted(numbers, key=lambda i: int(stages[i].partition("-")[0]))
-    for number in changed[-_PROBED:]:
-        keyframes = localizer.contents.scenes[number].keyframes
-        alone = localizer.only(number, np.arange(len(keyframes)))
-        alone.localize(keyframes.grey(0), keyframes.cameras[0])
 
 
 def _found(path: Path) -> tuple[int, ...]:
