@@ -127,6 +127,45 @@ def test_a_recording_is_copied_and_read(flaky: str, tmp_path: Path) -> None:
         assert len(load_recording(copy).train) > 50
 
 
+def test_a_copy_has_the_name_of_its_folder_and_all_names_before_their_bytes(
+    flaky: str,
+) -> None:
+    looks = []
+
+    def look(copy: Path) -> None:
+        sizes = {file.suffix: file.stat().st_size for file in copy.rglob("*.*")}
+        looks.append((copy.name, sizes[".jpg"] > 0, sizes[".json"] > 0))
+
+    with local_copy(flaky, look) as copy:
+        assert copy.name == "bedroom"
+    assert looks == [("bedroom", False, True), ("bedroom", True, True)]
+
+
+def test_a_listing_that_a_store_remembers_is_not_believed(
+    flaky: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listings: dict[str, Any] = {}
+    listed = MemoryFileSystem.ls
+
+    def remembered(self: Flaky, path: str, detail: bool = True, **options: Any) -> Any:
+        if path not in listings:
+            listings[path] = listed(self, path, detail=detail, **options)
+        return listings[path]
+
+    def forget(self: Flaky, path: str | None = None) -> None:
+        listings.clear()
+
+    monkeypatch.setattr(Flaky, "ls", remembered)
+    monkeypatch.setattr(Flaky, "invalidate_cache", forget)
+    before = addresses.stamps(flaky)
+    # Another machine writes.
+    fsspec.filesystem("memory").pipe({"/x": b"1"})
+    Flaky.store["/cell/bedroom/new.txt"] = MemoryFileSystem.store["/x"]
+    after = addresses.stamps(flaky)
+    assert {name for name, _ in {*after} - {*before}} == {"/cell/bedroom/new.txt"}
+    fsspec.filesystem("memory").rm("/x")
+
+
 def test_what_is_no_recording_is_refused_before_it_is_copied(
     flaky: str, tmp_path: Path
 ) -> None:

@@ -200,6 +200,14 @@ MIMIC = '<mimic joint="{}"/>'
             "joint k mimics j, which mimics it",
         ),
         (
+            (
+                joint("j", "ab", MIMIC.format("k")),
+                joint("k", "bc", MIMIC.format("l")),
+                joint("l", "cd", MIMIC.format("k")),
+            ),
+            "joint l mimics k, which mimics it",
+        ),
+        (
             (joint("j", "ab"), joint("k", "cd")),
             "no joints connect a and c; name others",
         ),
