@@ -248,6 +248,19 @@ def _guard() -> Table:
     return table
 
 
+def _mutants() -> Table:
+    """Mutants of each file, and those that the tests noticed before and now."""
+    rows = rows_of("mutants")
+    rows["file"] = rows["file"].str.removeprefix("src/evercal/")
+    real = rows[rows["outcome"] != "equivalent"]
+    groups = ["seed", "file"]
+    table = pd.DataFrame({"drawn": rows.groupby(groups, sort=False).size()})
+    table["not equivalent"] = real.groupby(groups).size()
+    for title, key in (("killed before", "before"), ("killed", "outcome")):
+        table[title] = (real[key] == "killed").groupby([real[k] for k in groups]).sum()
+    return table.reset_index().astype(str)
+
+
 TABLES: dict[str, Callable[[], Table]] = {
     "results: rooms and real recordings": _accuracy(
         _ROOMS,
@@ -305,6 +318,7 @@ TABLES: dict[str, Callable[[], Table]] = {
         "answer,rooms,map,asked,number,located,mm,mm_90,inside_95,wrong", "fisheye"
     ),
     "real-rooms: guard": _guard,
+    "tests: mutants": _mutants,
     "intrinsics: another camera of the model": _rows(
         "answer,camera,stated,answers,located,median_mm,95_%_mm,sigma_mm,inside_95_%,wrong",
         "same-model",

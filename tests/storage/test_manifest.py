@@ -32,6 +32,14 @@ def test_checksums_are_sha256_of_the_bytes(store: Path) -> None:
     assert records[FILES[0]] == {"sha256": sha256_file(store / FILES[0]), "bytes": 1000}
 
 
+def test_a_payload_that_is_no_json_changes_nothing(store: Path) -> None:
+    before = (store / MANIFEST).read_bytes()
+    for value in (float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="JSON"):
+            write_manifest(store, {"threshold": value}, FILES)
+    assert (store / MANIFEST).read_bytes() == before
+
+
 @pytest.mark.parametrize("relative", FILES)
 def test_damaged_files_are_named(store: Path, relative: str) -> None:
     file = store / relative

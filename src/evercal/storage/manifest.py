@@ -116,9 +116,7 @@ def write_manifest(
             "bytes": size,
         }
     # Converted to JSON and back, so that the checksum is that of the values that are read.
-    body = json.loads(
-        json.dumps({"payload": payload, "files": records}, allow_nan=False)
-    )
+    body = json.loads(json.dumps({"payload": payload, "files": records}))
     write_json(
         root / MANIFEST,
         {"format": _FORMAT, "schema": _SCHEMA, **body, "sha256": _body_sha256(body)},
