@@ -81,6 +81,8 @@ def test_agrees_with_matrices(case: tuple[int, str]) -> None:
     np.testing.assert_allclose(a.apply(points), twin, atol=1e-12)
     assert_close(SE3.from_matrix(a.matrix()), a)
     assert_close(SE3.from_matrix(a.matrix()[:, :3]), a)
+    # Of two quaternions the one with w >= 0 is chosen.
+    assert (SE3.from_matrix(a.matrix()).rotation_wxyz[:, 0] >= 0).all()
 
 
 @given(cases)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import time
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from websockets.sync.client import connect
 
 from evercal.bounds import RequestBounds
 from evercal.errors import InputError
+from evercal.service.guard import Guard, Metrics
 from evercal.service.hosts import is_local
 from evercal.service.server import ServeOptions, bound_socket
 
@@ -250,3 +252,62 @@ def wait_until_closed(service: Any, connection: socket.socket) -> None:
         assert time.monotonic() < deadline
         time.sleep(0.05)
     assert service.get("/health").status == 200
+
+
+def guard_of(app: Any) -> Guard:
+    return Guard(app, None, RequestBounds(), Metrics())
+
+
+SCOPE = {
+    "type": "http",
+    "method": "POST",
+    "path": "/localize",
+    "query_string": b"",
+    "headers": [(b"host", b"localhost"), (b"content-length", b"1")],
+}
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_work_that_the_server_cancels_is_answered_once(begun):
+    """Its patience is over: 503, unless the answer has begun."""
+    sent = []
+
+    async def send(message):
+        sent.append(message)
+
+    async def receive():
+        return {"type": "http.request", "body": b"x"}
+
+    async def endless(scope, receive, send):
+        if begun:
+            await send({"type": "http.response.start", "status": 200})
+        await asyncio.sleep(3600)
+
+    async def cancelled():
+        task = asyncio.create_task(guard_of(endless)(SCOPE, receive, send))
+        await asyncio.sleep(0.01)
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+        assert task.cancelled() == begun
+
+    asyncio.run(cancelled())
+    assert [one["status"] for one in sent if "status" in one] == [200 if begun else 503]
+
+
+def test_a_body_ends_with_the_message_that_says_no_more():
+    """Servers may leave `more_body` out of the last one; nothing is waited for after it."""
+    read = []
+
+    async def send(message): ...
+
+    async def receive():
+        read.append(1)
+        await asyncio.sleep(0)
+        return {"type": "http.request", "body": b"x"}
+
+    async def refuses(scope, receive, send):
+        await send({"type": "http.response.start", "status": 422})
+
+    asyncio.run(guard_of(refuses)(SCOPE, receive, send))
+    assert len(read) == 1
