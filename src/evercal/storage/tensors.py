@@ -73,20 +73,17 @@ class _OpenFile:
         self._opened = self._state()
         self.bytes, _ = self._opened
 
-    def read(self, start: int, count: int) -> NDArray[np.uint8]:
-        """Bytes from an offset on."""
-        content = np.empty(count, np.uint8)
-        left = content.data
+    def read(self, start: int, array: NDArray[Any]) -> NDArray[Any]:
+        """Fill an array with the bytes from an offset on."""
         with self._lock:
             self._file.seek(start)
-            while left and (arrived := self._file.readinto(left)):
-                left = left[arrived:]
-        if left or self._state() != self._opened:
+            count = self._file.readinto(array.data)
+        if count != array.nbytes or self._state() != self._opened:
             raise ValueError(
                 "it is too short, or was overwritten in place while it was open; replace a map by"
                 " 'mv'"
             )
-        return content
+        return array
 
     def _state(self) -> tuple[int, int]:
         status = os.fstat(self._file.fileno())
@@ -99,6 +96,7 @@ class StoredRows:
     def __init__(self, file: _OpenFile, start: int, like: NDArray[Any]):
         self._file = file
         self._start = start
+        self._row_bytes = like[:1].nbytes
         self._like = like
         self.dtype = like.dtype
         self.shape = like.shape
@@ -108,22 +106,23 @@ class StoredRows:
 
     def __getitem__(self, rows: slice) -> NDArray[Any]:
         part = self._like[rows]
-        first, _, _ = rows.indices(len(self))
-        start = self._start + first * self._like[:1].nbytes
-        with _reading(self._file.path):
-            return (
-                self._file.read(start, part.nbytes).view(part.dtype).reshape(part.shape)
-            )
+        first, _, _ = rows.indices(len(self._like))
+        array = np.empty(part.shape, part.dtype)
+        try:
+            return self._file.read(self._start + first * self._row_bytes, array)
+        except (OSError, ValueError) as error:
+            raise _unreadable(self._file.path, error) from None
 
 
 def open_tensors(path: Path) -> dict[str, StoredRows]:
     """The named arrays of a file, one or more dimensions each, which stays open."""
     with _reading(path):
         file = _OpenFile(path)
-        count = int.from_bytes(file.read(0, _LENGTH), "little")
+        count = int.from_bytes(file.read(0, np.empty(_LENGTH, np.uint8)), "little")
         if count > bounds().tensor_header_bytes:
             raise ValueError(f"its header would have {count} bytes")
-        header = json.loads(file.read(_LENGTH, count).tobytes())
+        text = file.read(_LENGTH, np.empty(count, np.uint8))
+        header = json.loads(text.tobytes())
         header.pop("__metadata__", None)
         start = _LENGTH + count
         arrays = {}
@@ -158,6 +157,10 @@ def _reading(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # nothing is assumed about a header
-        raise UnavailableError(
-            f"{path}: not readable ({error}); run 'evercal info --check'"
-        ) from None
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: Path, error: Exception) -> UnavailableError:
+    return UnavailableError(
+        f"{path}: not readable ({error}); run 'evercal info --check'"
+    )
