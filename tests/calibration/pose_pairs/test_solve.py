@@ -172,6 +172,24 @@ def test_lengths_are_stated_in_metres_unless_said_otherwise() -> None:
         assert {*found.equation.extras.names} == names
 
 
+@pytest.mark.parametrize(
+    ("camera_m", "board_m", "warned"),
+    [(1.0, 0.3, False), (1.0, 0.22, True), (0.35, 0.05, False), (0.45, 0.05, True)],
+)
+def test_a_camera_far_from_its_gripper_may_have_the_other_mount(
+    camera_m: float, board_m: float, warned: bool
+) -> None:
+    """It is doubted at 0.4 m, and four times as far as the board is from the base."""
+    truth = recording(EXACT, 0)
+    pairs = truth.pairs
+    carried = SE3(truth.parent_from_camera.rotation_wxyz, [0, 0, camera_m])
+    board = SE3(truth.fixed_from_board.rotation_wxyz, [board_m, 0, 0])
+    seen = (pairs.base_from_gripper @ carried).inverse() @ board
+    solved = solve(replace(pairs, camera_from_board=seen), "eye_in_hand")
+    warnings = solved.checks.to_dict()["warnings"]
+    assert any("if it is the other way round" in words for words in warnings) == warned
+
+
 REAL = Path(os.environ.get("EVERCAL_REAL_DATA", "")) / "handeye"
 FRANKA = Camera(640, 480, 607.593, 607.575, 323.463, 243.255)
 
