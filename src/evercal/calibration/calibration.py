@@ -25,7 +25,14 @@ from evercal.calibration.framed_pose import ImageUse as ImageUse
 from evercal.calibration.framed_pose import JointOffset as JointOffset
 from evercal.choices import ExportFormat
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation, pose_distance
+from evercal.geometry import (
+    SE3,
+    Camera,
+    UncertainPose,
+    axis_deviation,
+    pose_distance,
+    pose_to_dict,
+)
 from evercal.notebook import html_table
 from evercal.robot.mount import MountName, mount_named
 from evercal.storage import write_json
@@ -235,8 +242,7 @@ class RigPair(NamedTuple):
         return {
             "parent_frame": self.first,
             "child_frame": self.second,
-            "translation_m": pose.translation_m.tolist(),
-            "quaternion_wxyz": pose.rotation_wxyz.tolist(),
+            **(pose_to_dict(pose) or {}),
             "matrix": pose.matrix().tolist(),
             "covariance": self.first_from_second.covariance.tolist(),
         }
@@ -268,9 +274,7 @@ class Rig:
 
 def rig_of(cameras: Mapping[str, Calibration]) -> Rig:
     """Compute the relative poses of eye_to_hand cameras, as if their errors were independent."""
-    scenes = {}
-    for name, camera in cameras.items():
-        scenes[name] = camera.source.get("scene")
+    scenes = {name: camera.source.get("scene") for name, camera in cameras.items()}
     if len(cameras) < 2:
         raise InputError("a rig has at least two cameras: give NAME=FOLDER for each")
     if len(set(scenes.values())) > 1:

@@ -117,7 +117,8 @@ def shift_between(
     if same:
         # One camera in one map: the scatter of its images is the same before and now.
         before = int(reference.checks.images_used or 1)
-        measured.append((_image_scatter(reference), before))
+        stated = reference.checks.image_scatter or np.zeros((6, 6))
+        measured.append((np.array(stated), before))
         scatter = _scatter(measured)
         covariance = scatter / count + scatter / before + floor
         if scene.parent_frame == "gripper":
@@ -164,14 +165,6 @@ def shift_of(
         same_map=False,
         images=images,
     )
-
-
-def _image_scatter(reference: Calibration) -> Array:
-    """(6, 6) scatter of the images of a calibration; zeros if it states none."""
-    scatter = reference.checks.image_scatter
-    if scatter is None:
-        return np.zeros((6, 6))
-    return np.array(scatter)
 
 
 def _scatter(measured: Sequence[tuple[Array, int]]) -> Array:

@@ -118,12 +118,10 @@ def of_cause(located: Sequence[ImagePose], lens: bool) -> list[ImagePose]:
     """
     changed = []
     for item in located:
-        terms = []
-        for term in item.estimate.terms:
-            if (term.name == "lens") == lens:
-                terms.append(term.covariance)
-        covariance = sum(terms, np.zeros((6, 6)))
-        if not item.estimate.terms and not lens:
+        terms = item.estimate.terms
+        parts = [term.covariance for term in terms if (term.name == "lens") == lens]
+        covariance = sum(parts, np.zeros((6, 6)))
+        if not terms and not lens:
             covariance = item.covariance
         changed.append(replace(item, covariance=covariance))
     return changed

@@ -29,7 +29,7 @@ class Align(args.Verb):
     store: args.Store
     scene: Annotated[Positional[str], arg(metavar="SCENE")]
     """Name of the scene."""
-    images: Annotated[Positional[tuple[Path, ...]], args.shown("[IMAGE...]")] = ()
+    images: args.OptionalImages = ()
     """Images of a camera on the gripper, or a folder of them."""
     robot_poses: args.File = None
     """base_from_gripper of every image."""
@@ -98,9 +98,8 @@ class Align(args.Verb):
 
         if self.points is None or self.picks is None:
             raise InputError("--points and --picks belong together; give both")
-        points = {}
-        for (name,), point in read_rows(self.points, 1, "name, x, y, z"):
-            points[name] = point
+        rows = read_rows(self.points, 1, "name, x, y, z")
+        points = {name: point for (name,), point in rows}
         by_image: dict[str, dict[str, np.ndarray]] = {}
         for (image, name), pixel in read_rows(self.picks, 2, "image, name, u, v"):
             if name not in points:

@@ -31,6 +31,7 @@ def shown(word: str, default: str = "", **how: Any) -> Any:
 
 Store = Annotated[Positional[Path], arg(metavar="MAP", help="Folder of the map.")]
 ImageFiles = Annotated[Positional[tuple[Path, ...]], shown("IMAGE...")]
+OptionalImages = Annotated[Positional[tuple[Path, ...]], shown("[IMAGE...]")]
 File = Annotated[Path | None, shown("FILE")]
 Folder = Annotated[Path | None, shown("DIR")]
 Name = Annotated[str | None, shown("NAME")]
@@ -41,6 +42,8 @@ Seconds = Annotated[float | None, shown("SECONDS")]
 Count = Annotated[int | None, shown("N")]
 Number = Annotated[int, arg(metavar="N")]
 OutFile = Annotated[Path, arg(metavar="FILE")]
+InFile = OutFile
+InFolder = Annotated[Positional[Path], arg(metavar="DIR")]
 OutFolder = Annotated[Path, arg(metavar="DIR")]
 Host = Annotated[
     str, arg(metavar="H", help="Address to listen on, such as 0.0.0.0 for all.")
@@ -54,6 +57,7 @@ At = Annotated[
         " that the camera sees: its standard deviation in the base or gripper frame is stated.",
     ),
 ]
+Address = Annotated[str | None, shown("ADDRESS")]
 Device = Annotated[
     Literal["auto", "cpu", "cuda"],
     arg(
@@ -146,6 +150,9 @@ class Reading:
             if value is not True:
                 words.append(str(value))
         return words
+
+
+HowRead = Annotated[Reading, arg(name="")]
 
 
 def option(field: str) -> str:

@@ -2,10 +2,9 @@
 
 import dataclasses
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
 from evercal.cli import args
 from evercal.errors import InputError
@@ -22,7 +21,7 @@ class Audit(args.Verb):
     """
 
     store: args.Store
-    folder: Annotated[Positional[Path], arg(metavar="DIR")]
+    folder: args.InFolder
     """Folder whose folders are the episodes: recorded scenes, or images beside a calibration.json
     or a 4x4 matrix base_from_camera.txt."""
     calibration: args.File = None

@@ -22,7 +22,7 @@ class Convert(args.Verb):
     """Folder of the recording, or file of a bag."""
     out: Annotated[Positional[Path], arg(metavar="OUT")]
     """Output folder; created if it is missing."""
-    reading: Annotated[args.Reading, arg(name="")] = field(default_factory=args.Reading)
+    reading: args.HowRead = field(default_factory=args.Reading)
     name: args.Name = None
     """Name of the scene. Default: the recording's own name."""
     hard_link: bool = False

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
 from evercal.choices import BoardKind, CameraModel
 from evercal.cli import args
@@ -42,7 +42,7 @@ class Detect(args.Verb):
 
     board: BoardKind
     """Printed board; aprilgrid: Kalibr's, arucogrid: OpenCV's GridBoard."""
-    images: Annotated[Positional[tuple[Path, ...]], args.shown("[IMAGE...]")] = ()
+    images: args.OptionalImages = ()
     """Image files of one camera, or a folder of them."""
     size: Annotated[str | None, args.shown("CxR")] = None
     """Inner corners of a chessboard (9x6), squares of a ChArUco board, or markers of a grid."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from evercal.cli import args
 from evercal.cli.calibrate import at_record, calibration_lines, joint_lines
@@ -31,7 +31,7 @@ class EyeToHand(args.Verb):
     """Keep the thing as a scene of this map: `check` and `calibrate` with --robot-poses use it."""
     name: args.Name = None
     """Name of that scene. Default: the recording's own name."""
-    reading: Annotated[args.Reading, arg(name="")] = field(default_factory=args.Reading)
+    reading: args.HowRead = field(default_factory=args.Reading)
     at: args.At = None
 
     def run(self) -> int:

@@ -28,7 +28,7 @@ class Inspect(args.Verb):
 
     scene: Annotated[Positional[Path], arg(metavar="RECORDING")]
     """Folder of the recording, or file of a bag."""
-    reading: Annotated[args.Reading, arg(name="")] = field(default_factory=args.Reading)
+    reading: args.HowRead = field(default_factory=args.Reading)
     coverage: bool = False
     """Also measure every image of a wrist recording: what is covered, missing, blurred, doubled."""
     next: Annotated[Path | None, args.shown("POSES", "(default: none)")] = None

@@ -76,13 +76,13 @@ class Learn(args.Verb):
     """An encoder as ONNX file, for a new map. Default: the shipped one."""
     strategy: args.Name = None
     """evercal builds a map; every other strategy trains a network. Default: that of the store."""
-    reading: Annotated[args.Reading, arg(name="")] = field(default_factory=args.Reading)
+    reading: args.HowRead = field(default_factory=args.Reading)
     networks: Annotated[NetworkOptions, arg(name="")] = field(
         default_factory=NetworkOptions
     )
     workers: args.Number = 1
     """Recordings to learn in parallel."""
-    ray: Annotated[str | None, args.shown("ADDRESS")] = None
+    ray: args.Address = None
     """Learn on a Ray cluster: auto, HOST:PORT or ray://HOST:PORT. All its machines reach the
     recordings."""
     results: Annotated[str | None, args.shown("DIR|ADDRESS")] = None
@@ -266,12 +266,9 @@ def learn_into_networks(
 
     options = NetworkLearnOptions(
         strategy=strategy,
-        preset=wanted.preset,
         memory=given.memory or "10%",
-        centres=wanted.centres,
         encoder=given.encoder,
-        device=wanted.device,
-        seed=wanted.seed,
+        **vars(wanted),
     )
     return learn_networks(given.store, recording, options, show)
 

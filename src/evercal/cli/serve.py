@@ -2,7 +2,6 @@
 
 import os
 from dataclasses import dataclass
-from typing import Annotated
 
 from evercal.cli import args
 from evercal.errors import InputError, missing_extra
@@ -28,7 +27,7 @@ class Serve(args.Verb):
     token_file: args.File = None
     """File of the bearer token that requests must have, readable by you alone. Default: the
     variable EVERCAL_TOKEN."""
-    ray: Annotated[str | None, args.shown("ADDRESS")] = None
+    ray: args.Address = None
     """Serve from a Ray cluster (auto, HOST:PORT or ray://HOST:PORT); its head listens."""
     replicas: args.Number = 1
     """Processes that answer in the cluster, each with one core."""

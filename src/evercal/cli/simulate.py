@@ -3,7 +3,6 @@
 import re
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
@@ -22,7 +21,7 @@ class Simulate(args.Verb):
 
     kind: Annotated[Positional[Literal["cell"]], arg(name="KIND")]
     """What is simulated: cell. Furnished rooms are rendered by 'python -m rooms' in a checkout."""
-    out: Annotated[Path, arg(metavar="DIR")]
+    out: args.OutFolder
     """Output folder, which is new or empty."""
     frames: args.Count = None
     """Images of the wrist camera. Default: 25."""

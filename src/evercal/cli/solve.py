@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import arg
-
 from evercal.choices import MountName
 from evercal.cli import args
 from evercal.cli.calibrate import calibration_lines
@@ -29,9 +27,9 @@ class Solve(args.Verb):
     Example: evercal solve --robot-poses poses.csv --camera-poses board.json --mount eye_in_hand
     """
 
-    robot_poses: Annotated[Path, arg(metavar="FILE")]
+    robot_poses: args.InFile
     """base_from_gripper of every image: a pose table, JSON, NPY or NPZ."""
-    camera_poses: Annotated[Path, arg(metavar="FILE")]
+    camera_poses: args.InFile
     """camera_from_board of every image: from 'evercal detect', or like --robot-poses."""
     mount: MountName
     """eye_in_hand: camera on the gripper. eye_to_hand: fixed camera, board in the gripper."""
@@ -94,8 +92,6 @@ class Solve(args.Verb):
 
     def _with_image_paths(self, calibration: "Calibration") -> "Calibration":
         """Make image paths relative to the calibration, where `evercal report` looks them up."""
-        from evercal.calibration.checks import PairChecks
-
         folder = self.camera_poses.absolute().parent
         target = self.out.absolute().parent
 
@@ -108,7 +104,6 @@ class Solve(args.Verb):
         images = [
             replace(image, name=moved(image.name)) for image in calibration.images
         ]
-        assert isinstance(calibration.checks, PairChecks), "made by solve"
         by_image = {}
         for key in _BY_IMAGE:
             values = getattr(calibration.checks, key) or {}
@@ -120,10 +115,7 @@ class Solve(args.Verb):
 
 
 def _check_lines(calibration: "Calibration") -> Iterator[str]:
-    from evercal.calibration.checks import PairChecks
-
     checks = calibration.checks
-    assert isinstance(checks, PairChecks), "made by solve"
     camera = calibration.camera
     if checks.held_out_mm is not None:
         error = f"{checks.held_out_mm:.2f} mm and {checks.held_out_deg:.3f} deg"

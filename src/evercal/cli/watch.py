@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
 from evercal.cli import args
 from evercal.cli.check import Reference, shift_line
@@ -38,7 +38,7 @@ class Watch(args.Verb):
     """
 
     store: args.Store
-    folder: Annotated[Positional[Path], arg(metavar="DIR")]
+    folder: args.InFolder
     """Folder that images arrive in."""
     reference: Reference
     window: args.Number = 5

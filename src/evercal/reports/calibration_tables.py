@@ -168,10 +168,8 @@ def check_table(calibration: Calibration) -> Table:
 def source_table(name: str, calibration: Calibration) -> Table:
     """What the calibration was made from."""
     source = {"file": name, **calibration.source, "created": calibration.created}
-    rows = []
-    for key, value in source.items():
-        if value:
-            rows.append((key.replace("_", " "), _cell(value)))
+    stated = [(key, value) for key, value in source.items() if value]
+    rows = [(key.replace("_", " "), _cell(value)) for key, value in stated]
     return Table(("property", "value"), rows)
 
 

@@ -378,9 +378,7 @@ def moveit(export: Export) -> str:
         )
     effectors = pose_numbers(robot.poses, "matrix").tolist()
     objects = pose_numbers(targets, "matrix").tolist()
-    samples = []
-    for effector, target_object in zip(effectors, objects, strict=True):
-        samples.append(
-            {"effector_wrt_world": effector, "object_wrt_sensor": target_object}
-        )
+    keys = ("effector_wrt_world", "object_wrt_sensor")
+    pairs = zip(effectors, objects, strict=True)
+    samples = [dict(zip(keys, pair, strict=True)) for pair in pairs]
     return _yaml(samples, None, 1000)

@@ -73,9 +73,8 @@ class HandEyeStart:
         if self.arm is not None:
             frames = with_offsets(frames, self.arm)
         poses = scene_from_parent(frames, self.mount) @ self.parent_from_camera
-        train = []
-        for frame, pose in zip(frames, poses, strict=True):
-            train.append(replace(frame, base_from_camera=pose))
+        pairs = zip(frames, poses, strict=True)
+        train = [replace(frame, base_from_camera=pose) for frame, pose in pairs]
         untracked = recording.untracked + len(recording.train) - len(frames)
         return replace(recording, train=tuple(train), untracked=untracked)
 

@@ -75,10 +75,7 @@ def from_many_spots(
     base = base_covariance
     if base is None:
         base = np.zeros((6, 6))
-    slopes = []
-    for parent, camera in zip(parents, cameras, strict=True):
-        slopes.append(_by_scene_motion(parent, camera))
-    slopes = np.stack(slopes)
+    slopes = np.stack([*map(_by_scene_motion, parents, cameras)])
     by_base = slopes.mean(0) @ base @ slopes.mean(0).T
     whole = mean_covariance(used)
     of_base = (slopes @ base @ slopes.transpose(0, 2, 1)).mean(0)

@@ -72,7 +72,7 @@ def _still(greys: Sequence[NDArray[Any]]) -> tuple[BoolArray, BoolArray]:
     size = (PATCH_PX, PATCH_PX)
     images = [grey.astype(np.float32) for grey in greys]
     means = [cv2.blur(image, size) for image in images]
-    variances = np.stack([_variance(image) for image in images])
+    variances = np.maximum([_raw_variance(image) for image in images], 0)
     # Most of two images is equal but for the noise.
     changes = []
     for before, after in itertools.pairwise(images):
@@ -90,16 +90,10 @@ def _still(greys: Sequence[NDArray[Any]]) -> tuple[BoolArray, BoolArray]:
     return repeated >= STILL_IMAGES, variances > (1 + LEAST_CONTRAST) * noise
 
 
-def _variance(image: Float32Array) -> Float32Array:
-    """Variance of the patch around each pixel."""
+def _raw_variance(image: Float32Array) -> Float32Array:
+    """Variance of the patch around each pixel, with its rounding errors."""
     size = (PATCH_PX, PATCH_PX)
-    mean = cv2.blur(image, size)
-    return np.maximum(cv2.blur(image * image, size) - mean * mean, 0)
-
-
-def _raw_variance(change: Float32Array) -> Float32Array:
-    size = (PATCH_PX, PATCH_PX)
-    return cv2.blur(change**2, size) - cv2.blur(change, size) ** 2
+    return cv2.blur(image**2, size) - cv2.blur(image, size) ** 2
 
 
 def _opened(moving: BoolArray) -> BoolArray:

@@ -17,10 +17,7 @@ def in_windows(recording: Recording, start: HandEyeStart) -> Recording:
     around = windows(recording.train, start)
     if around is None:
         return recording
-    train = []
-    for frame, window in zip(recording.train, around, strict=True):
-        train.append(cropped(frame, window))
-    return replace(recording, train=tuple(train))
+    return replace(recording, train=tuple(map(cropped, recording.train, around)))
 
 
 def of_whole_images(scene: SceneMap, whole: Camera) -> SceneMap:

@@ -19,6 +19,7 @@ from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation, Unknowns
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
+from evercal.recordings.poses.pairing import counted
 from evercal.storage.text_files import few
 from evercal.typing import IntArray
 
@@ -79,7 +80,7 @@ def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
     n = len(pairs)
     if n < MIN_POSES:
         raise InputError(
-            f"{_counted(n, 'pose pair')}; hand-eye calibration takes at least"
+            f"{counted(n, 'pose pair')}; hand-eye calibration takes at least"
             f" {MIN_POSES}, because an outlier among fewer cannot be detected; {_RECORD}"
         )
     _require_metres(pairs, pairs.base_from_gripper, "robot")
@@ -89,7 +90,7 @@ def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
     if len(different) < MIN_POSES:
         names = few([pairs.names[i] for i in different], most=_NAMES)
         raise InputError(
-            f"{n} pose pairs hold only {_counted(len(different), 'different one')}"
+            f"{n} pose pairs hold only {counted(len(different), 'different one')}"
             f" ({names}); repeats add nothing: {_RECORD}"
         )
     _require_motion(pairs[different], scale_known)
@@ -102,12 +103,6 @@ def require_observable(pairs: PosePairs, scale_known: bool = True) -> None:
             f" {1000 * spread:.1f} mm), so the scale of the camera poses is open; also move the"
             f" gripper by 10 cm or more between poses"
         )
-
-
-def _counted(n: int, what: str) -> str:
-    if n == 1:
-        return f"1 {what}"
-    return f"{n} {what}s"
 
 
 def require_two_lists(pairs: PosePairs) -> None:

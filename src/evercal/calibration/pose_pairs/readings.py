@@ -15,6 +15,7 @@ from evercal.calibration.pose_pairs.starts import quick_fit
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.conventions import (
     CONVENTIONS,
+    OPENGL_FROM_OPENCV,
     pose_convention,
     poses_from_numbers,
 )
@@ -23,8 +24,6 @@ from evercal.typing import Array
 
 _LENGTHS = {1.0: "m", 0.001: "mm"}
 """Words of conventions for units, by metres."""
-_FLIP = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
-"""Half a turn about x, between the camera axes of OpenGL and OpenCV."""
 
 
 class Reading(NamedTuple):
@@ -63,7 +62,7 @@ SAME_EQUATION: dict[str, _Change] = {
     " (`invert` both)": lambda robot, camera: (robot.inverse(), camera.inverse()),
     "the board is behind the camera, as if the camera poses had OpenGL's axes (y up, z back):"
     " append :opengl to `camera_convention`, or convert the poses to OpenCV's axes (y down, z"
-    " forward)": lambda robot, camera: (robot, _FLIP @ camera),
+    " forward)": lambda robot, camera: (robot, OPENGL_FROM_OPENCV @ camera),
 }
 """Readings that agree as well as the given one, by message."""
 OTHER_ROBOT: dict[str, _Change] = {

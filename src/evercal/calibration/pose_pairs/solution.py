@@ -126,9 +126,8 @@ class PairSolution:
         rms = np.sqrt((residuals**2).sum(2).mean(0))
         distance = np.linalg.norm(self.equation.camera_translation[fit.inliers], axis=1)
         moved = 1000 * np.linalg.norm(fit.moved[:, :3], axis=1)
-        boards: dict[str, object] = {}
-        for i, pose in zip(self.rows, self.camera_from_board, strict=True):
-            boards[names[i]] = pose_to_dict(pose)
+        rows = zip(self.rows, self.camera_from_board, strict=True)
+        boards = {names[i]: pose_to_dict(pose) for i, pose in rows}
         scene = mount_named(self.mount).scene
         checks: dict[str, Any] = {
             "poses_given": len(self.pairs),

@@ -14,7 +14,7 @@ import numpy as np
 from evercal.geometry import Camera
 from evercal.geometry.camera import COEFFICIENTS
 from evercal.recordings.cameras.radial_models import RADIAL_MODELS, nearest_fisheye
-from evercal.recordings.poses.row_files import is_number
+from evercal.recordings.poses.row_files import by_alias, is_number
 from evercal.storage.text_files import few
 from evercal.typing import Array
 
@@ -24,16 +24,7 @@ Size = tuple[int, int]
 """Width and height, pixels."""
 
 
-def _by_alias(table: str) -> dict[str, str]:
-    """Names by alias, of lines `name: alias alias`."""
-    names: dict[str, str] = {}
-    for line in table.strip().splitlines():
-        name, _, aliases = line.partition(":")
-        names |= dict.fromkeys(aliases.split(), name)
-    return names
-
-
-_NAMES = _by_alias("""
+_NAMES = by_alias("""
 camera_matrix: cameramatrix intrinsicmatrix mtx k
 camera_matrix: cameraintrinsics intrinsics intrinsic
 camera_matrix: projectionparameters
@@ -50,7 +41,7 @@ cx: cx ppx
 cy: cy ppy
 """)
 """Names of fields by their aliases."""
-_MODELS = {"": "brown"} | _by_alias("""
+_MODELS = {"": "brown"} | by_alias("""
 brown: plumbbob rationalpolynomial
 brown: brownconrady radtan radialtangential
 brown: opencv fullopencv
@@ -168,10 +159,7 @@ def camera_of(data: Fields, size: Size | None) -> Camera:
         distortion = ()
     _refuse_other_models(models, distortion)
     matrix = _matrix(fields, data)
-    if is_ros:
-        width, height = _size(fields, data, None)
-    else:
-        width, height = _size(fields, data, size)
+    width, height = _size(fields, data, None if is_ros else size)
     _refuse_unknown(data)
     camera = Camera.from_matrix(matrix, width, height)
     camera = replace(camera, distortion=distortion, model=model)
@@ -289,12 +277,7 @@ def _matrix(fields: Fields, data: Fields) -> Array:
 
 
 def _matrix_of(fx: float, fy: float, cx: float, cy: float) -> Array:
-    matrix = np.eye(3)
-    matrix[0, 0] = fx
-    matrix[1, 1] = fy
-    matrix[0, 2] = cx
-    matrix[1, 2] = cy
-    return matrix
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def _size(fields: Fields, data: Fields, size: Size | None) -> tuple[Any, Any]:
@@ -384,9 +367,7 @@ def numbers_of(value: Any, name: str, count: int | None = None) -> list[float]:
     if isinstance(value, dict):
         value = value.get("data")
     try:
-        if not isinstance(value, list):
-            raise TypeError
-        if bool in map(type, value):
+        if not isinstance(value, list) or bool in map(type, value):
             raise TypeError
         # YAML 1.1 reads 1e-05, as written by ROS, as a word.
         array = np.array(value, dtype=np.float64)

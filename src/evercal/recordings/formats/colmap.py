@@ -75,9 +75,7 @@ def load(root: Path, options: ReadOptions) -> Recording:
         notes.append(
             f"took model {folder.name}, the one with the most images ({', '.join(sizes)})"
         )
-    cameras = {}
-    for key, camera in model.cameras.items():
-        cameras[key] = _camera(folder, camera)
+    cameras = {key: _camera(folder, part) for key, part in model.cameras.items()}
     posed = [image for image in model.images.values() if image.has_pose]
     posed.sort(key=lambda image: natural_key(image.name))
     if not posed:

@@ -104,12 +104,10 @@ def write(
         writer.untracked = recording.untracked
         writer.notes = recording.notes
         writer.metric = recording.metric
-        for frame in recording.train:
-            writer.add(frame, "train")
-            on_frame()
-        for frame in recording.test:
-            writer.add(frame, "test")
-            on_frame()
+        for split in ("train", "test"):
+            for frame in getattr(recording, split):
+                writer.add(frame, split)
+                on_frame()
 
 
 class SceneWriter:

@@ -26,6 +26,7 @@ from evercal.recordings.images import (
     image_size,
     is_readable,
 )
+from evercal.recordings.poses.conventions import OPENGL_FROM_OPENCV
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import (
@@ -52,8 +53,6 @@ _FILES = (
 fisheye lens."""
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
 """Camera models that are read."""
-_GL_FROM_CV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
-"""OpenGL axes (right, up, backward) from OpenCV axes (right, down, forward)."""
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Numbers of `distortion_params`, in this order."""
 _TOLERANCE = 1e-2
@@ -187,7 +186,7 @@ def _frame(root: Path, data: Entry, entry: object, undo: SE3, scale: float) -> F
         stated = SE3.from_matrix(matrix, _TOLERANCE)
         camera = _camera({**data, **entry})
     applied_from_gl = SE3(stated.rotation_wxyz, stated.translation_m / scale)
-    world_from_camera = undo @ applied_from_gl @ _GL_FROM_CV
+    world_from_camera = undo @ applied_from_gl @ OPENGL_FROM_OPENCV
     return Frame(name, _image(root, name), camera, world_from_camera)
 
 

@@ -44,27 +44,36 @@ from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import named_errors
 from evercal.typing import Image
 
-_ENCODINGS: dict[str, tuple[int, int, str | None]] = {
-    "rgb8": (1, 3, None),
-    "bgr8": (1, 3, "BGR2RGB"),
-    "8UC3": (1, 3, "BGR2RGB"),
-    "rgba8": (1, 4, None),
-    "bgra8": (1, 4, "BGRA2RGB"),
-    "8UC4": (1, 4, "BGRA2RGB"),
-    "rgb16": (2, 3, None),
-    "bgr16": (2, 3, "BGR2RGB"),
-    "mono8": (1, 1, None),
-    "8UC1": (1, 1, None),
-    "mono16": (2, 1, None),
-    "bayer_rggb8": (1, 1, "BayerBG2RGB"),
-    "bayer_bggr8": (1, 1, "BayerRG2RGB"),
-    "bayer_gbrg8": (1, 1, "BayerGR2RGB"),
-    "bayer_grbg8": (1, 1, "BayerGB2RGB"),
-    "yuv422": (1, 2, "YUV2RGB_UYVY"),
-    "uyvy": (1, 2, "YUV2RGB_UYVY"),
-    "yuv422_yuy2": (1, 2, "YUV2RGB_YUY2"),
-    "yuyv": (1, 2, "YUV2RGB_YUY2"),
-}
+
+def _encodings(table: str) -> dict[str, tuple[int, int, str]]:
+    encodings = {}
+    for line in table.strip().splitlines():
+        name, size, channels, conversion = line.split()
+        encodings[name] = (int(size), int(channels), conversion)
+    return encodings
+
+
+_ENCODINGS = _encodings("""
+rgb8 1 3 -
+bgr8 1 3 BGR2RGB
+8UC3 1 3 BGR2RGB
+rgba8 1 4 -
+bgra8 1 4 BGRA2RGB
+8UC4 1 4 BGRA2RGB
+rgb16 2 3 -
+bgr16 2 3 BGR2RGB
+mono8 1 1 -
+8UC1 1 1 -
+mono16 2 1 -
+bayer_rggb8 1 1 BayerBG2RGB
+bayer_bggr8 1 1 BayerRG2RGB
+bayer_gbrg8 1 1 BayerGR2RGB
+bayer_grbg8 1 1 BayerGB2RGB
+yuv422 1 2 YUV2RGB_UYVY
+uyvy 1 2 YUV2RGB_UYVY
+yuv422_yuy2 1 2 YUV2RGB_YUY2
+yuyv 1 2 YUV2RGB_YUY2
+""")
 """Bytes of a channel, number of channels, and OpenCV's COLOR_... constant if `as_rgb` needs it. ROS
 names a Bayer pattern by its first two pixels and OpenCV by its second row."""
 
@@ -274,7 +283,7 @@ def _rgb(pixels: NDArray[Any], encoding: str) -> Image:
     import cv2
 
     conversion = _ENCODINGS[encoding][2]
-    if conversion is not None:
+    if conversion != "-":
         pixels = cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}"))
     return as_rgb(pixels)
 

@@ -127,11 +127,8 @@ def _layouts(root: Path) -> list[RecordingLayout]:
             tables.append(RecordingLayout(name))
     if tables:
         return tables
-    layouts = []
-    for layout in LAYOUTS:
-        if (root / layout.poses).exists() and (root / layout.images).is_dir():
-            layouts.append(layout)
-    return layouts
+    with_poses = [layout for layout in LAYOUTS if (root / layout.poses).exists()]
+    return [layout for layout in with_poses if (root / layout.images).is_dir()]
 
 
 def _frames(root: Path, layout: RecordingLayout, options: ReadOptions) -> Recording:

@@ -20,11 +20,12 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry.se3 import SE3
+from evercal.recordings.poses.row_files import by_alias
 from evercal.typing import Array, BoolArray
 
 _TOLERANCE = 1e-2
 """Error of a quaternion's length, or of R^T R, if printed with three digits."""
-_OPENGL_FROM_OPENCV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
+OPENGL_FROM_OPENCV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
 """Rotation between the camera axes of OpenGL and OpenCV; its own inverse."""
 
 
@@ -118,21 +119,13 @@ _CONVENTIONS = (
 )
 CONVENTIONS = {convention.name: convention for convention in _CONVENTIONS}
 """All conventions by name, without modifiers."""
-VENDORS = {
-    "mitsubishi": "yaskawa",
-    "denso": "yaskawa",
-    "techman": "yaskawa",
-    "jaka": "yaskawa",
-    "dobot": "yaskawa",
-    "aubo": "yaskawa",
-    "xarm": "yaskawa",
-    "epson": "kuka",
-    "nachi": "kuka",
-    "doosan": "kawasaki",
-    "comau": "kawasaki",
-    "universal_robots": "ur",
-    "motoman": "yaskawa",
-}
+VENDORS = by_alias("""
+yaskawa: mitsubishi denso techman jaka dobot aubo xarm
+kuka: epson nachi
+kawasaki: doosan comau
+ur: universal_robots
+yaskawa: motoman
+""")
 """Further vendors and the convention, with its units, that each uses."""
 KNOWN_CONVENTIONS = (
     f"{', '.join([*CONVENTIONS, *VENDORS])}, fixed_xyz or moving_zyx with any order of axes,"
@@ -212,8 +205,8 @@ def poses_from_numbers(
     if not convention.has("opengl"):
         return poses
     if camera_from:
-        return _OPENGL_FROM_OPENCV @ poses
-    return poses @ _OPENGL_FROM_OPENCV
+        return OPENGL_FROM_OPENCV @ poses
+    return poses @ OPENGL_FROM_OPENCV
 
 
 def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
@@ -222,7 +215,7 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
     Quaternions get w >= 0. In gimbal lock the third angle is 0.
     """
     if convention.has("opengl"):
-        poses = poses @ _OPENGL_FROM_OPENCV
+        poses = poses @ OPENGL_FROM_OPENCV
     if convention.has("inverse"):
         poses = poses.inverse()
     translation = poses.translation_m / convention.metres_per_unit

@@ -80,10 +80,9 @@ def pair_joints(
     times = _image_times(images, rows, stamps_s)
     if times is None or rows.stamps_s is None:
         return list(values)
-    at_images = np.empty((len(times), values.shape[1]))
-    for joint, column in enumerate(values.T):
-        at_images[:, joint], _ = interpolate(rows.stamps_s, column, times)
-    return list(at_images)
+    stamps = rows.stamps_s
+    at_images = [interpolate(stamps, column, times)[0] for column in values.T]
+    return list(np.transpose(at_images))
 
 
 def poses_of_images(
@@ -112,23 +111,17 @@ def unpaired(images: Sequence[str], rows: Sequence[str], file: str) -> list[str]
     """Notes of images and rows of a file whose names have no counterpart."""
     notes = []
     if images:
-        count = _count(len(images), "image")
+        count = counted(len(images), "image")
         notes.append(f"{count} without a row in {file}: {few(images, rows)}")
     if rows:
-        count = _count(len(rows), "row")
+        count = counted(len(rows), "row")
         notes.append(f"{count} of {file} without an image: {few(rows)}")
     return notes
 
 
 def _of_rows(values: Any, numbers: Sequence[int | None]) -> list[Any]:
     """Values of rows, and None for None."""
-    of_rows = []
-    for number in numbers:
-        value = None
-        if number is not None:
-            value = values[number]
-        of_rows.append(value)
-    return of_rows
+    return [None if number is None else values[number] for number in numbers]
 
 
 def _by_name(
@@ -148,10 +141,8 @@ def _by_name(
         if _are_names(starts) and _are_names(key_starts):
             rows, unused = _rows_of_keys([*zip(starts)], key_starts)
     if len(unused) < len(keys):
-        alone = []
-        for name, row in zip(files, rows, strict=True):
-            if row is None:
-                alone.append(name)
+        pairs = zip(files, rows, strict=True)
+        alone = [name for name, row in pairs if row is None]
         return rows, unpaired(alone, unused, file.name)
     if same_numbers(names, files):
         note = f"paired by numbers: {names[0]} with {files[0]}, and so on"
@@ -200,9 +191,9 @@ def _by_time(times: Array, track: PoseTrack, file: Path) -> Pairing:
             f" {times.max():.3f} s, poses at {first:.3f} to {last:.3f} s; are the clocks the same?"
             f" If not, name the image of each row in a column image"
         )
-    notes = [f"poses were interpolated at the times of {_count(len(times), 'image')}"]
+    notes = [f"poses were interpolated at the times of {counted(len(times), 'image')}"]
     if not valid.all():
-        invalid = _count(int((~valid).sum()), "image")
+        invalid = counted(int((~valid).sum()), "image")
         notes.append(
             f"{invalid} taken outside the recorded poses or in a gap of more than {MAX_GAP_S:g} s"
             f" with motion"
@@ -232,7 +223,8 @@ def _image_times(
     return np.array(times, dtype=np.float64)
 
 
-def _count(number: int, what: str) -> str:
+def counted(number: int, what: str) -> str:
+    """A number of things in words: 1 image, 2 images."""
     if number != 1:
         what += "s"
     return f"{number} {what}"

@@ -60,11 +60,8 @@ def rotations_with_translations(
         match = _TRANSLATION.fullmatch(name)
         if match and (len(shape) > 1 or (plural and shape)):
             translations[key] = match[1]
-    pairs = []
-    for rotation, translation in product(rotations, translations):
-        if rotations[rotation] == translations[translation]:
-            pairs.append((rotation, translation))
-    return pairs
+    pairs = product(rotations, translations)
+    return [(r, t) for r, t in pairs if rotations[r] == translations[t]]
 
 
 def composed_poses(

@@ -122,9 +122,7 @@ def _of_objects(entries: list[Any], given: Given, robot: bool) -> PoseTable:
     keys = dict.fromkeys(chain.from_iterable(rows))
     require_at_most(len(keys), "columns", "keys")
     require_at_most(len(keys) * len(rows), "numbers", "values")
-    columns: Columns = {}
-    for key in keys:
-        columns[key] = [row.get(key) for row in rows]
+    columns = {key: [row.get(key) for row in rows] for key in keys}
     columns = _of_role(columns, given, robot)
     frames = columns.get("child_frame_id", ())
     frames = sorted({*map(str, frames)})
@@ -192,10 +190,8 @@ def _of_object(data: Columns, given: Given, robot: bool) -> PoseTable:
 
 def _rows_of(columns: Columns) -> list[dict[str, Any]]:
     """An object for each pose, of the lists of its keys."""
-    rows = []
-    for values in zip(*columns.values(), strict=True):
-        rows.append(dict(zip(columns, values, strict=True)))
-    return rows
+    poses = zip(*columns.values(), strict=True)
+    return [dict(zip(columns, values, strict=True)) for values in poses]
 
 
 def _keys_of_images(data: Columns) -> list[str]:

@@ -76,9 +76,7 @@ def rotation_warnings(
         better = GRIPPER_BETTER
     stated, readings = _readings(poses, pairs, of_camera)
     error = error_of(measured, stated)
-    errors = {}
-    for reading, vectors in readings.items():
-        errors[reading] = error_of(measured, vectors)
+    errors = {name: error_of(measured, turned) for name, turned in readings.items()}
     improved = min(errors.values()) < error / better
     agree = GRIPPER_AGREE_DEG if improved and not of_camera else AGREE_DEG
     if error < agree:

@@ -59,9 +59,8 @@ class PoseTrack:
         still = (metres < STILL_M) & (np.rad2deg(radians) < STILL_DEG)
         valid &= close | still
         rotation = Slerp(times, self.poses.rotation)(inside)
-        position = np.empty((len(inside), 3))
-        for axis, values in enumerate(self.poses.translation_m.T):
-            position[:, axis] = np.interp(inside, times, values)
+        axes = self.poses.translation_m.T
+        position = np.stack([np.interp(inside, times, axis) for axis in axes], 1)
         poses = SE3.of(rotation, position, canonical=False)
         return poses, valid
 

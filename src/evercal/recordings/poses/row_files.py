@@ -322,6 +322,15 @@ def in_unit(stamps: Array, unit: str | None = None) -> Array:
     return stamps / _PER_SECOND[unit]
 
 
+def by_alias(table: str) -> dict[str, str]:
+    """Names by alias, of lines `name: alias alias`."""
+    names: dict[str, str] = {}
+    for line in table.strip().splitlines():
+        name, _, aliases = line.partition(":")
+        names |= dict.fromkeys(aliases.split(), name)
+    return names
+
+
 def is_number(cell: object) -> bool:
     """Whether Python reads a cell as a number."""
     try:
