@@ -10,9 +10,9 @@ from typing import Any
 _LONGEST = 2_000
 """Characters of a message, which may repeat what came from outside."""
 _USER = re.compile(
-    r"(?<=://)([^\s/@:'\"]*:(?!:|\d+(/|\s|$))((?!::)[^\s'\"])*@|[^\s/@'\"]*@)"
+    r"(:/{1,2})([^\s/@:'\"]*:(?!:|\d+(/|\s|$))((?!::)[^\s'\"])*@|[^\s/@'\"]*@)"
 )
-_QUERY = re.compile(r"(://[^\s?'\"]*)\?((?!::)[^\s'\"])*?(?=:?(\s|['\"]|::|$))")
+_QUERY = re.compile(r"(:/{1,2}[^\s?'\"]*)\?((?!::)[^\s'\"])*?(?=:?(\s|['\"]|::|$))")
 _FIELD = re.compile(r"`([a-z]\w*)`")
 """An argument in a message: `robot_poses`."""
 
@@ -44,8 +44,8 @@ class UnavailableError(InputError):
 
 
 def without_secrets(text: str) -> str:
-    """A text whose addresses lack user, password and query, chained ones (`::`) as well."""
-    return _QUERY.sub(r"\1", _USER.sub("", text))
+    """A text whose addresses lack user, password and query; also chained, and as paths (`s3:/`)."""
+    return _QUERY.sub(r"\1", _USER.sub(r"\1", text))
 
 
 def with_options(text: str) -> str:

@@ -73,8 +73,10 @@ ARRAYS: dict[str, Callable[[Arrays], object]] = {
         descriptors=a["descriptors"][:, :64]
     ),
     "parts of .1, 2. keyframes": lambda a: a.update(descriptors=a["descriptors"][:1]),
-    "descriptors: numbers are finite": lambda a: a["descriptors"].fill(np.nan),
+    "descriptors: numbers are below": lambda a: a["descriptors"].fill(np.nan),
     "parts of .1, 2. keyframe": lambda a: a.update(poses=a["poses"][:1]),
+    "keyframe 0: no depths": lambda a: a["inverse_depth"].fill(0),
+    "depths: numbers are below": lambda a: a["inverse_depth"].__setitem__(3, np.nan),
     "47 depths of 6x8 cells": lambda a: a.update(
         cells=np.array([47, 49]),
     ),
@@ -91,9 +93,11 @@ SCENES: dict[str, Callable[[dict[str, Any]], object]] = {
     "is a covariance": lambda s: s["frame"].update(
         base_covariance=(-np.eye(6)).tolist()
     ),
-    "frame: numbers are finite": lambda s: s["frame"].update(pose_sigma=[1e999, 0]),
-    "the scale is positive": lambda s: s["frame"].update(scale=0),
-    "unit: numbers are finite": lambda s: s.update(unit=1e999, metric=False),
+    "frame: numbers are below": lambda s: s["frame"].update(pose_sigma=[1e999, 0]),
+    "scale and sigma are positive": lambda s: s["frame"].update(scale=0),
+    "sigma are positive": lambda s: s["frame"].update(pose_sigma=[-1, 0]),
+    "camera: numbers are below": lambda s: s["adjusted_camera"].update(fx=1e300),
+    "unit: numbers are below": lambda s: s.update(unit=1e999, metric=False),
     "TypeError": lambda s: s.update(train_frames="many"),
 }
 PAYLOADS: list[tuple[dict[str, Any], str]] = [
@@ -175,6 +179,28 @@ def test_a_report_that_is_no_object_is_named(root: Path) -> None:
     for read in (stored_scenes, lambda path: MapStore.open(path).reports()):
         with pytest.raises(InputError, match=r"report\.json: holds no JSON object"):
             read(root)
+
+
+@pytest.mark.parametrize("file", ["encoder", "report.json", SCENE])
+def test_an_archive_of_a_map_that_no_command_reads(
+    root: Path, tmp_path: Path, file: str
+) -> None:
+    path = next(root.glob("encoder*"))
+    if file != "encoder":
+        path = root / STAGE / file
+    path.write_bytes(b"[]")
+    rewritten(root, {})
+    pack_map(root, tmp_path / "map.zip")
+    with pytest.raises(InputError, match=r"map\.zip: "):
+        unpack_map(tmp_path / "map.zip", tmp_path / "copy")
+    assert not (tmp_path / "copy").exists()
+
+
+def test_a_scene_without_files_is_named(root: Path) -> None:
+    before = Manifest.read(root)
+    payload = before.payload | {"stages": [*before.payload["stages"], "0009-none"]}
+    write_manifest(root, payload, [*before.files])
+    refused_everywhere(root, "0009-none/scene.json: is missing")
 
 
 def test_a_manifest_is_read_before_anything_is_extracted(

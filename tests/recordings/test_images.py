@@ -1,5 +1,6 @@
 """Images keep pixels and colours, are turned upright, and broken files are refused."""
 
+import os
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,7 @@ from evercal.recordings import (
     write_image,
 )
 from evercal.recordings.frame import Recording
+from evercal.recordings.image_files import image_files
 from evercal.recordings.images import UnturnedImage, as_stored, pixels_of
 
 from .checks import refused, with_orientation
@@ -157,3 +159,13 @@ def test_image_of_another_size_than_its_camera_is_refused(tmp_path: Path) -> Non
         assert Frame("a", picture, camera, None).read_image().shape == image.shape
     with pytest.raises(InputError, match="b: image is 16x32, its camera 32x16"):
         Frame("b", image.transpose(1, 0, 2), camera, None).read_image()
+
+
+def test_what_is_no_file_is_no_image(tmp_path: Path) -> None:
+    """Reading a pipe would wait for ever."""
+    pipe = tmp_path / "a.jpg"
+    os.mkfifo(pipe)
+    with pytest.raises(InputError, match="no images in this folder"):
+        image_files([tmp_path])
+    with pytest.raises(InputError, match=r"a.jpg: image file is missing, or no file"):
+        image_files([pipe])

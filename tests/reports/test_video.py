@@ -88,6 +88,32 @@ def test_interrupted_video_leaves_the_old_file(tmp_path: Path) -> None:
     assert (tmp_path / "a.mp4").read_bytes() == b"old"
 
 
+def test_a_video_that_lacks_frames_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """OpenCV says nothing of a full disk."""
+
+    class Silent:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def isOpened(self) -> bool:
+            return True
+
+        def write(self, _: object) -> None:
+            pass
+
+        def release(self) -> None:
+            pass
+
+    monkeypatch.setattr(cv2, "VideoWriter", Silent)
+    Silent.fourcc = lambda *_: 0  # type: ignore[attr-defined]
+    frames = iter([np.zeros((64, 96, 3), np.uint8)] * 3)
+    with pytest.raises(InputError, match=r"a.mp4: cannot be written; is the disk full"):
+        write_video(tmp_path / "a.mp4", frames)
+    assert not list(tmp_path.iterdir())
+
+
 def test_other_endings_are_refused() -> None:
     with pytest.raises(
         InputError, match=r"a\.avi: not a video format.*help: end it with \.mp4"

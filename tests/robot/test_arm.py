@@ -252,6 +252,15 @@ def test_chains_that_are_not_understood_are_refused_by_name(
             (joint("j", "ab", origin='<origin xyz="0 0 nan"/>'),),
             "'0 0 nan' are not three fin",
         ),
+        (
+            (joint("j", "ab", origin='<origin xyz="0 0 1e300"/>'),),
+            "'0 0 1e300' are not three fin",
+        ),
+        (
+            (joint("j", "ab", origin='<origin xyz="0 0 1"/><origin xyz="0 0 2"/>'),),
+            "joint j: it has two of origin",
+        ),
+        ((joint("j", "aa"),), "joint j: 'a' is its parent and its child"),
         ((joint("j", "ab", axis="0 0 1 0"),), "'0 0 1 0' are not three finite numbers"),
     ],
 )
@@ -268,6 +277,7 @@ def test_urdfs_without_one_meaning_are_refused(
         (('xyz="0.4 0.1 0.2"', "xyz=0.4 0.1 0.2"), "no usable URDF: it is no XML: not well"),
         (('rpy="0.3', '& rpy="0.3'), "it is no XML: not well-formed .* line 1, column"),
         (('<joint name="j"', '<!DOCTYPE r><joint name="j"'), "it is no XML"),
+        (("<robot", '<?xml version="1.0" encoding="a"?><robot'), "XML: unknown encoding"),
         (("<robot", "<!DOCTYPE robot><robot"), "it has a DOCTYPE, which no URDF needs"),
         (("<link", "<l"), "it has no links; make a URDF"),
         (("</robot>", "</robot><robot/>"), "it is no XML: junk after document element"),

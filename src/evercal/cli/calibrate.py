@@ -73,7 +73,7 @@ class Calibrate(args.Verb):
         named = []
         for word in self.images:
             name, sign, path = word.partition("=")
-            if sign and not Path(word).exists():
+            if sign and "/" not in name and not Path(word).exists():
                 named.append(word)
                 folders[name] = Path(path)
         if named and len(named) < len(self.images):

@@ -57,7 +57,7 @@ def load_named(words: tuple[str, ...]) -> "dict[str, Recording]":
     for word in words:
         name, sign, path = word.partition("=")
         # The name of a folder may contain '='.
-        if not sign or not name or Path(word).is_dir():
+        if not sign or not name or "/" in name or Path(word).is_dir():
             name = ""
             path = word
         scene = load_recording(path, name=name or None)

@@ -17,6 +17,9 @@ from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import size_in_header
 
+_MOST = 1e6
+"""Pixels, metres, or whatever a unit is."""
+
 
 @contextmanager
 def of_evercal(folder: Path) -> Iterator[None]:
@@ -25,6 +28,8 @@ def of_evercal(folder: Path) -> Iterator[None]:
         yield
     except TooLargeError as error:
         raise InputError(f"{folder}: {error}") from None
+    except FileNotFoundError as error:
+        raise InputError(f"{error.filename}: is missing; restore the map") from None
     except (InputError, OSError):
         raise
     except Exception as error:
@@ -37,13 +42,15 @@ def of_evercal(folder: Path) -> Iterator[None]:
 
 def require_consistent(scene: SceneMap) -> None:
     """Raise an error where the parts of a scene contradict each other."""
+    keyframes = scene.keyframes
     for camera in (scene.camera, scene.adjusted_camera):
         require_image_size(camera.width, camera.height, "camera")
-    keyframes = scene.keyframes
+        _require_small("camera", camera.fx, camera.fy, camera.cx, camera.cy)
+    _require_small("poses", keyframes.base_from_camera.translation_m)
     descriptors = keyframes.descriptors
     assert descriptors is not None, "a map has descriptors"
-    _require_finite("unit", scene.unit or 1.0, scene.intrinsics_sigma)
-    _require_finite("descriptors", descriptors)
+    _require_small("unit", scene.unit or 1.0, scene.intrinsics_sigma)
+    _require_small("descriptors", descriptors)
     _require_frame(scene.frame)
     _require(scene.train_frames > 0, "a scene has training frames")
     counts = {
@@ -77,6 +84,7 @@ def require_of_encoder(scene: SceneMap, encoder: Encoder, short_side: int) -> No
             f"keyframe {i}: {len(depths)} depths of {rows}x{columns} cells",
         )
         _require((depths > 0).any(), f"keyframe {i}: no depths")
+        _require_small(f"keyframe {i}: depths", depths)
 
 
 def require_landmarks(arrays: Mapping[str, Any], cameras: Sequence[Camera]) -> None:
@@ -96,7 +104,7 @@ def require_landmarks(arrays: Mapping[str, Any], cameras: Sequence[Camera]) -> N
     _require((pixels < size).all(), "landmarks lie in their images")
     _require((depths > 0).all(), "landmarks have depths")
     for name in ("inverse_depth", "sigma", "slope"):
-        _require_finite("landmarks", arrays[f"landmark_{name}"][:])
+        _require_small("landmarks", arrays[f"landmark_{name}"][:])
 
 
 def _require_keyframe(keyframes: Keyframes, i: int) -> None:
@@ -112,8 +120,10 @@ def _require_keyframe(keyframes: Keyframes, i: int) -> None:
 
 
 def _require_frame(frame: MapFrame) -> None:
-    _require(frame.scale > 0, "the scale is positive")
-    _require_finite("frame", frame.pose_sigma, frame.frame_sigma, frame.scale)
+    least = min(*frame.pose_sigma, *frame.frame_sigma)
+    _require(frame.scale > 0 and least >= 0, "scale and sigma are positive")
+    _require_small("frame", frame.common.translation_m)
+    _require_small("frame", frame.pose_sigma, frame.frame_sigma, frame.scale)
     covariance = frame.base_covariance
     if covariance is not None:
         least = np.linalg.eigvalsh(covariance)[0]
@@ -125,13 +135,14 @@ def _require_frame(frame: MapFrame) -> None:
     if correction is not None:
         shape = (len(correction.poses), 6)
         _require(correction.correction.shape == shape, f"correction is {shape}")
-        _require_finite("correction", correction.correction, correction.radius)
+        _require_small("correction", correction.correction, correction.radius)
 
 
-def _require_finite(name: str, *values: Any) -> None:
+def _require_small(name: str, *values: Any) -> None:
+    """Raise ValueError for numbers that no room and no camera has."""
     for part in values:
-        finite = np.isfinite(part)
-        _require(finite.all(), f"{name}: numbers are finite")
+        small = np.abs(np.asarray(part, np.float64)) < _MOST
+        _require(small.all(), f"{name}: numbers are below {_MOST:g}")
 
 
 def _require(holds: object, what: str) -> None:

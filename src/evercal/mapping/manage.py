@@ -27,7 +27,14 @@ from evercal.storage.archive import (
 )
 from evercal.storage.atomic import replace_folder, write_bytes, write_json
 from evercal.storage.manifest import MANIFEST, Manifest
-from evercal.storage.stages import REPORT, STAGES, StageStore, is_store, read_store
+from evercal.storage.stages import (
+    REPORT,
+    STAGES,
+    StageStore,
+    is_store,
+    read_report,
+    read_store,
+)
 from evercal.storage.text_files import read_json
 from evercal.typing import PathLike
 
@@ -369,7 +376,12 @@ def _require_listed(sizes: dict[str, int], manifest: Manifest, file: Path) -> No
 
 def _require_map_of(root: Path, file: Path) -> None:
     try:
-        _incoming(root)
+        manifest, _ = _incoming(root)
+        for stage in manifest.payload["stages"]:
+            read_report(root / STAGES / stage)
+        # A function of the caller's own cannot be read here.
+        if manifest.payload["networks"][0].endswith(".onnx"):
+            MapStore.open(root)
     except InputError as error:
         raise InputError(
             f"{file}: {str(error).replace(str(root), file.name)}"

@@ -1,5 +1,6 @@
 """Folders and files that all machines reach: paths, and addresses of object stores by fsspec."""
 
+import hashlib
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +16,8 @@ from evercal.storage.text_files import library_errors
 Check = Callable[[Path], object]
 _TEXTS = (".csv", ".json", ".txt", ".urdf", ".yaml", ".yml")
 """Endings of files by which recordings are recognised."""
+_READ = {"atime", "time"}
+"""Times of reading, as SFTP states them."""
 
 
 def is_address(text: object) -> bool:
@@ -64,7 +67,7 @@ def _copy(store: Any, root: str, target: Path, check: Check) -> None:
             raise ValueError(f"its file {file!r} leads out of it; rename it")
         copy.parent.mkdir(parents=True, exist_ok=True)
         copy.touch()
-        if copy.suffix in _TEXTS and sizes[file] <= bounds().text_bytes:
+        if _is_text(file, sizes[file]):
             texts.append(file)
     for files in (texts, copies.keys() - texts):
         for file in files:
@@ -74,10 +77,24 @@ def _copy(store: Any, root: str, target: Path, check: Check) -> None:
         check(target)
 
 
+def _is_text(file: str, size: int) -> bool:
+    return file.endswith(_TEXTS) and size <= bounds().text_bytes
+
+
 def stamps(address: str) -> list[tuple[str, ...]]:
-    """Name and version of every file at an address; a file that changes gets another version."""
+    """Name and version of every file at an address; a file that changes gets another version.
+
+    fsspec's own `ukey` is that of the address over HTTP, and another one in each process for zip.
+    """
     with _store(address) as (store, root):
-        return [(file, str(store.ukey(file))) for file in _files(store, root)]
+        stamped = []
+        for file, size in _files(store, root).items():
+            info = store.info(file)
+            version = [f"{key}={info[key]}" for key in sorted(info.keys() - _READ)]
+            if _is_text(file, size):  # times may be whole seconds
+                version.append(hashlib.sha256(store.cat_file(file)).hexdigest())
+            stamped.append((file, *version))
+        return stamped
 
 
 def exists(address: str) -> bool:

@@ -24,5 +24,7 @@ def image_files(paths: Sequence[PathLike]) -> list[Path]:
         elif path.is_file():
             files.append(path)
         else:
-            raise InputError(f"{path}: image file is missing; check the path")
+            raise InputError(
+                f"{path}: image file is missing, or no file; check the path"
+            )
     return files

@@ -61,7 +61,8 @@ class TrackFile(AbstractContextManager["TrackFile"]):
             self._file.flush()
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        with naming_file(self._path):
+            self._file.close()
 
 
 def _tum_line(frame: TrackedFrame) -> str:

@@ -65,9 +65,15 @@ def write_video(path: Path, frames: Iterator[Image]) -> None:
                 "`video`: this OpenCV cannot write videos; help: install opencv-python-headless,"
                 " or pass `overlay` DIR for pictures"
             )
+        count = 0
         for image in itertools.chain([first], frames):
             writer.write(image[..., ::-1])
+            count += 1
         writer.release()
+        # The writer is silent about a full disk.
+        written = cv2.VideoCapture(str(whole)).get(cv2.CAP_PROP_FRAME_COUNT)
+        if written < count:
+            raise InputError(f"`video` {path}: cannot be written; is the disk full?")
         whole.replace(path)
 
 

@@ -1,6 +1,5 @@
 """`parsed_urdf`: links and joints of a URDF, by one strict reading of its XML."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -16,6 +15,8 @@ _ENDS = (
     "parent link",
     "child link",
 )
+_MOST = 1e6
+"""No number of an arm is so large."""
 _DEFAULTS = {
     "origin xyz": "0 0 0",
     "origin rpy": "0 0 0",
@@ -26,6 +27,8 @@ _DEFAULTS = {
     "limit upper": "inf",
 }
 """Numbers of a joint, and what they are if they are omitted."""
+_PARTS = {name.partition(" ")[0] for name in (*_ENDS[2:], *_DEFAULTS)}
+"""Elements of a joint that count."""
 _KNOWN = {
     *_ENDS,
     *_DEFAULTS,
@@ -109,7 +112,10 @@ def _elements(data: bytes) -> list[Element]:
         start = parser.CurrentByteIndex + blank
         if len(above) == 1 and tag in ("link", "joint"):
             elements.append(Element(tag, attributes, {tag: start}))
-        elif len(above) == 2 and above[1] == "joint" and tag not in elements[-1].starts:
+        elif len(above) == 2 and above[1] == "joint":
+            if tag in elements[-1].starts and tag in _PARTS:
+                name = elements[-1].stated.get("name")
+                raise ValueError(f"joint {name}: it has two of {tag}")
             elements[-1].starts[tag] = start
             for name, value in attributes.items():
                 elements[-1].stated[f"{tag} {name}"] = value
@@ -124,7 +130,7 @@ def _elements(data: bytes) -> list[Element]:
     parser.StartDoctypeDeclHandler = refuse
     try:
         parser.Parse(data[blank:], True)
-    except expat.ExpatError as error:
+    except (expat.ExpatError, LookupError) as error:  # LookupError: its encoding
         raise ValueError(
             f"it is no XML: {error}; a part is missing, a tag is wrong, or the text is not UTF-8"
         ) from None
@@ -133,12 +139,15 @@ def _elements(data: bytes) -> list[Element]:
 
 def _joint(element: Element) -> Joint:
     name, kind, parent, child = map(element.stated.__getitem__, _ENDS)
+    if parent == child:
+        raise ValueError(f"'{child}' is its parent and its child")
     numbers = {}
     for key, default in _DEFAULTS.items():
         text = element.stated.get(key, default)
         count = len(default.split())
         numbers[key] = [*map(float, text.split())]
-        finite = key.startswith("limit") or all(map(math.isfinite, numbers[key]))
+        small = [abs(number) < _MOST for number in numbers[key]]
+        finite = key.startswith("limit") or all(small)
         if len(numbers[key]) != count or not finite:
             words = (
                 "one finite number",
