@@ -14,7 +14,9 @@ from evercal.localization.estimate import PoseEstimate
 from evercal.localization.intrinsics import INTRINSICS
 from evercal.localization.lack_of_fit import LackOfFit, lack_of_fit
 from evercal.localization.localizer import Localizer
+from evercal.localization.matching import turned
 from evercal.localization.pose_refinement import Observed, minimise
+from evercal.localization.query import Encoded
 from evercal.map import Map
 from evercal.recordings.samples import sample_rooms
 
@@ -145,3 +147,16 @@ def test_a_mirrored_image_is_refused_by_name(bedroom: Localizer) -> None:
     assert any("the image is mirrored" in answer.reason for answer, _ in answers)
     plain = located(bedroom, np.eye(2, 3), ROOM.test[::10])
     assert all(answer.status == "ok" for answer, _ in plain)
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_a_mirrored_image_is_recognised_in_every_quarter_turn(
+    bedroom: Localizer, turns: int
+) -> None:
+    image = turned(ROOM.test[24].read_image()[:, ::-1], turns)
+    query = bedroom.query(image, None)
+    features = bedroom.contents.encoder.encode(image, bedroom.contents.short_side)
+    mirror = bedroom.poses.matcher.mirrored(replace(query, encoded=Encoded(features)))
+    assert mirror is not None
+    # The image was turned after it had been mirrored.
+    assert mirror.encoded.turns == turns

@@ -78,16 +78,16 @@ class Matcher:
         return Encoded(self._bank.encoder(turned(grey, turns)), turns=turns)
 
     def mirrored(self, query: Query) -> Query | None:
-        """The mirror image, upside down or not, if its middle is more similar to keyframes."""
-        axis = self._most_similar_view(query, [1, 2], _mirror)
-        if not axis:
+        """The mirror image in a quarter turn whose middle is more similar to keyframes."""
+        number = self._most_similar_view(query, [1, 2, 3, 4], _mirror)
+        if not number:
             return None
         image = _mirror(query.image, 1)
         cameras = []
         for camera in query.cameras:
             cameras.append(replace(camera, cx=camera.width - 1 - camera.cx))
         grey = working_grey(image, self._short_side)
-        turns = 2 * (axis - 1)
+        turns = number - 1
         encoded = Encoded(self._bank.encoder(turned(grey, turns)), turns=turns)
         return replace(query, image=image, cameras=cameras, encoded=encoded)
 
@@ -192,9 +192,9 @@ def _grid(encoded: Encoded, stride: int) -> IntArray:
     return np.arange(rows * columns).reshape(rows, columns)[::stride, ::stride].ravel()
 
 
-def _mirror(image: Image, axis: int) -> Image:
-    """An image mirrored left to right (1), or top to bottom (2)."""
-    return np.ascontiguousarray(np.flip(image, axis % 2))
+def _mirror(image: Image, number: int) -> Image:
+    """An image mirrored left to right (1), and then turned by quarters (2, 3, 4)."""
+    return turned(np.flip(image, 1), number - 1)
 
 
 def turned(image: Image, turns: int) -> Image:
