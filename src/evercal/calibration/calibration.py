@@ -25,14 +25,7 @@ from evercal.calibration.framed_pose import ImageUse as ImageUse
 from evercal.calibration.framed_pose import JointOffset as JointOffset
 from evercal.choices import ExportFormat
 from evercal.errors import InputError
-from evercal.geometry import (
-    SE3,
-    Camera,
-    UncertainPose,
-    axis_deviation,
-    pose_distance,
-    pose_to_dict,
-)
+from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation, pose_distance
 from evercal.notebook import html_table
 from evercal.robot.mount import MountName, mount_named
 from evercal.storage import write_json
@@ -242,7 +235,8 @@ class RigPair(NamedTuple):
         return {
             "parent_frame": self.first,
             "child_frame": self.second,
-            **(pose_to_dict(pose) or {}),
+            "translation_m": pose.translation_m.tolist(),
+            "quaternion_wxyz": pose.rotation_wxyz.tolist(),
             "matrix": pose.matrix().tolist(),
             "covariance": self.first_from_second.covariance.tolist(),
         }

@@ -6,13 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from evercal.calibration.calibration import Calibration, ErrorTerm, read_calibration
-from evercal.calibration.checks import checks_of
-from evercal.calibration.framed_pose import ImageUse, JointOffset
+from evercal.calibration.calibration import (
+    FORMAT,
+    VERSION,
+    Calibration,
+    read_calibration,
+)
 from evercal.errors import InputError
-from evercal.geometry import SE3
 from evercal.robot.mount import mount_named
 from evercal.storage.stages import is_store
 from evercal.typing import PathLike
@@ -74,24 +74,22 @@ def _of_version_0_1(report: Mapping[str, Any]) -> Calibration:
         checks["image_scatter"] = values["image_scatter"]
     if values.get("joints_move_mm"):
         checks["joints_move_mm"] = values["joints_move_mm"]
-    calibration = Calibration(
-        mount.name,
-        SE3(values["quaternion_wxyz"], values["translation_m"]),
-        np.array(values["covariance"]),
-        parent_frame=mount.parent,
-        images=tuple(ImageUse(**row) for row in values.get("images", ())),
-        error_terms=tuple(ErrorTerm(**row) for row in values.get("error_terms", ())),
-        joints=tuple(JointOffset(**row) for row in values.get("joints", ())),
-        joint_covariance=np.array(values.get("joint_covariance", ())),
-        checks=checks_of(checks),
-        source={
+    record = {
+        **values,
+        "format": FORMAT,
+        "version": VERSION,
+        "mount": mount.name,
+        "parent_frame": mount.parent,
+        "child_frame": "camera",
+        "checks": checks,
+        "source": {
             "command": "learn" if mount.moves else "eye-to-hand",
             "scene": report.get("scene"),
             "frames": int(report["train_frames"]),
             "map": values.get("map", ""),
         },
-        created=values.get("created", ""),
-    )
+    }
+    calibration = Calibration.from_dict(record)
     warnings = values.get("warnings", ())
     sentences = verdict_of(calibration, warnings, values.get("advice", ""))
     return replace(calibration, verdict=sentences)

@@ -2,9 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from tyro.conf import Positional, arg
+from typing import TYPE_CHECKING
 
 from evercal.cli import args
 from evercal.errors import InputError
@@ -27,7 +25,7 @@ class Align(args.Verb):
     """
 
     store: args.Store
-    scene: Annotated[Positional[str], arg(metavar="SCENE")]
+    scene: args.SceneName
     """Name of the scene."""
     images: args.OptionalImages = ()
     """Images of a camera on the gripper, or a folder of them."""

@@ -44,6 +44,8 @@ Number = Annotated[int, arg(metavar="N")]
 OutFile = Annotated[Path, arg(metavar="FILE")]
 InFile = OutFile
 InFolder = Annotated[Positional[Path], arg(metavar="DIR")]
+NewFolder = Annotated[Positional[Path], arg(metavar="OUT")]
+SceneName = Annotated[Positional[str], arg(metavar="SCENE")]
 OutFolder = Annotated[Path, arg(metavar="DIR")]
 Host = Annotated[
     str, arg(metavar="H", help="Address to listen on, such as 0.0.0.0 for all.")

@@ -191,9 +191,8 @@ def _progress(step: "CompletedStage") -> str:
         return f"{start} {step.strategy} {seed}: no results before the last stage"
     shares = 100 * rows["within_5cm_5deg"] / rows["frames"]
     scenes = rows["scene"] + shares.map(" {:.1f}".format)
-    strategies = []
-    for name, group in scenes.groupby(rows["strategy"], sort=False):
-        strategies.append(f"{name} {seed}: {', '.join(group)}")
+    groups = scenes.groupby(rows["strategy"], sort=False)
+    strategies = [f"{name} {seed}: {', '.join(group)}" for name, group in groups]
     seconds = rows["seconds"].iloc[0]
     text = "; ".join(strategies)
     return f"{start} {text} % within 5 cm, 5 deg ({seconds:.0f} s)"

@@ -20,7 +20,7 @@ class Convert(args.Verb):
 
     scene: Annotated[Positional[Path], arg(metavar="IN")]
     """Folder of the recording, or file of a bag."""
-    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    out: args.NewFolder
     """Output folder; created if it is missing."""
     reading: args.HowRead = field(default_factory=args.Reading)
     name: args.Name = None

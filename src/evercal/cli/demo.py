@@ -115,13 +115,12 @@ def run_demo(
     finally:
         shutil.rmtree(work, ignore_errors=True)
     cell = Map.open(store)
-    scenes = {}
+    scenes = {room.scene.name: room.scene for room in rooms}
     changed = {}
     for room in rooms:
-        name = room.scene.name
-        scenes[name] = room.scene
         if room.changed:
-            changed[name] = replace(room.changed, train=room.scene.train)
+            train = room.scene.train
+            changed[room.scene.name] = replace(room.changed, train=train)
     result.test = _evaluate(cell, scenes)
     result.changed = _evaluate(cell, changed)
     result.cameras = [_fixed_camera(cell, room) for room in rooms]

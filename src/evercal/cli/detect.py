@@ -157,10 +157,10 @@ class Detect(args.Verb):
         from evercal.recordings import read_image
 
         folder = self.out.absolute().parent
-        by_name = {}
-        for file in files:
-            path = Path(os.path.relpath(file.absolute(), folder))
-            by_name[path.as_posix()] = file
+        by_name = {
+            Path(os.path.relpath(file.absolute(), folder)).as_posix(): file
+            for file in files
+        }
         with progress_bar("detecting", len(files), "image") as bar:
 
             def read(name: str) -> "Image | str":

@@ -80,17 +80,18 @@ def _map(store: Path) -> tuple[Sequence[dict[str, Any]], int, int, dict[str, int
     opened = MapStore.open(store)
     scenes = []
     for scene, report in zip(opened.contents.scenes, opened.reports(), strict=True):
-        record = {
-            "name": scene.name,
-            "train_frames": scene.train_frames,
-            "memory_bytes": scene.keyframes.bytes,
-            "keyframes": len(scene.keyframes),
-            "camera": scene.camera.to_dict(),
-            "landmarks": scene.landmarks,
-            "adjusted": report.get("adjusted"),
-            "hand_eye": report.get("hand_eye"),
-        }
-        scenes.append(record)
+        scenes.append(
+            {
+                "name": scene.name,
+                "train_frames": scene.train_frames,
+                "memory_bytes": scene.keyframes.bytes,
+                "keyframes": len(scene.keyframes),
+                "camera": scene.camera.to_dict(),
+                "landmarks": scene.landmarks,
+                "adjusted": report.get("adjusted"),
+                "hand_eye": report.get("hand_eye"),
+            }
+        )
     return scenes, opened.contents.short_side, 0, opened.size_bytes()
 
 

@@ -133,14 +133,15 @@ def _coverage_lines(covered: "Coverage") -> Iterator[str]:
 def _next_records(views: "NextViews") -> list[dict[str, object]]:
     records = []
     for i, pose in enumerate(views.poses):
-        record = {
-            "row": int(views.index[i]) + 1,
-            "translation_m": pose.translation_m.tolist(),
-            "quaternion_wxyz": pose.rotation_wxyz.tolist(),
-            "sigma_mm": views.sigma_mm[i + 1],
-            "sigma_deg": views.sigma_deg[i + 1],
-        }
-        records.append(record)
+        records.append(
+            {
+                "row": int(views.index[i]) + 1,
+                "translation_m": pose.translation_m.tolist(),
+                "quaternion_wxyz": pose.rotation_wxyz.tolist(),
+                "sigma_mm": views.sigma_mm[i + 1],
+                "sigma_deg": views.sigma_deg[i + 1],
+            }
+        )
     return records
 
 

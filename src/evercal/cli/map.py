@@ -54,13 +54,14 @@ class List(Action):
         for scene in MapStore.open(self.store).contents.scenes:
             keyframes = len(scene.keyframes)
             memory = scene.keyframes.bytes
-            record = {
-                "name": scene.name,
-                "keyframes": keyframes,
-                "landmarks": scene.landmarks,
-                "memory_bytes": memory,
-            }
-            scenes.append(record)
+            scenes.append(
+                {
+                    "name": scene.name,
+                    "keyframes": keyframes,
+                    "landmarks": scene.landmarks,
+                    "memory_bytes": memory,
+                }
+            )
             counts = f"{keyframes} keyframes, {scene.landmarks:,} landmarks"
             lines.append(f"{scene.name}: {counts}, {size(memory)}")
         if not lines:
@@ -94,7 +95,7 @@ class Rename(Action):
     """
 
     store: args.Store
-    name: Annotated[Positional[str], arg(metavar="SCENE")]
+    name: args.SceneName
     """Name of the scene."""
     new: Annotated[Positional[str], arg(metavar="NEW")]
     """Its new name."""

@@ -26,7 +26,7 @@ class Reconstruct(args.Verb):
 
     source: Annotated[Positional[Path], arg(metavar="VIDEO|DIR")]
     """Video file, or folder of images of one camera."""
-    out: Annotated[Positional[Path], arg(metavar="OUT")]
+    out: args.NewFolder
     """New folder: a COLMAP model and its images."""
     motion: Annotated[float, arg(metavar="SHARE")] = 0.04
     """Motion from one chosen frame of a video to the next, parts of its width."""

@@ -38,9 +38,7 @@ class Simulate(args.Verb):
 
         began = time.perf_counter()
         options = CellOptions()
-        frames = cell.WRIST_IMAGES
-        if self.frames is not None:
-            frames = self.frames
+        frames = cell.WRIST_IMAGES if self.frames is None else self.frames
         if self.size is not None:
             size = re.fullmatch(r"(\d+)x(\d+)", self.size)
             if size is None:

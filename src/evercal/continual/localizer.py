@@ -87,9 +87,8 @@ class NetworkLocalizer:
         cameras = _fitting_cameras(camera, image, scenes.scenes)
         features = scenes.encoder.encode(image, scenes.short_side)
         encoded = Encoded(features)
-        tried = []
-        for scene in self._candidates(encoded, cameras):
-            tried.append(self._hypothesis(encoded, scene, cameras))
+        scenes_tried = self._candidates(encoded, cameras)
+        tried = [self._hypothesis(encoded, scene, cameras) for scene in scenes_tried]
         best = max(tried, key=_support)
         return self._answer(best, 1000 * (time.perf_counter() - began))
 

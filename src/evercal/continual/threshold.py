@@ -56,9 +56,8 @@ def fit_threshold(
         if metres < _NEAR_M and radians < _NEAR_RAD:
             squared.append(pose.squared_mahalanobis(frame.base_from_camera))
     small = records[index].camera.short_side_resized(scenes.short_side)
-    negatives = []
-    for image in _negative_views(small.width, small.height):
-        negatives.append(localizer.localize(image).inlier_ratio)
+    others = _negative_views(small.width, small.height)
+    negatives = [localizer.localize(image).inlier_ratio for image in others]
     high = float(np.quantile(negatives, 0.95))
     low = float(np.quantile(positives or [1.0], 0.05))
     threshold = high + ACCEPTANCE_FRACTION * max(0.0, low - high)

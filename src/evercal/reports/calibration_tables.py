@@ -114,16 +114,17 @@ def use_table(calibration: Calibration) -> Table:
     moved = checks.leave_one_out_mm or {}
     rows = []
     for image in images:
-        row = (
-            image.name.removeprefix(folder),
-            "yes" if image.used else "no",
-            image.reason,
-            _fixed(image.residual_mm, 2),
-            _fixed(image.residual_deg, 3),
-            _fixed(share.get(image.name), 1),
-            _fixed(moved.get(image.name), 3),
+        rows.append(
+            (
+                image.name.removeprefix(folder),
+                "yes" if image.used else "no",
+                image.reason,
+                _fixed(image.residual_mm, 2),
+                _fixed(image.residual_deg, 3),
+                _fixed(share.get(image.name), 1),
+                _fixed(moved.get(image.name), 3),
+            )
         )
-        rows.append(row)
     measures = (
         "residual (mm)",
         "residual (deg)",

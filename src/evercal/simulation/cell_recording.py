@@ -65,10 +65,8 @@ def record_cell(
     camera = cell.tripod_camera
     yield from _record(cell, camera, views, HELD_IMAGES, out / "held")
     write_bytes(out / "reachable.csv", pose_rows(reachable).encode())
-    rows = []
-    for row in nominal_mount().matrix():
-        words = [f"{x:.9g}" for x in row]
-        rows.append(" ".join(words) + "\n")
+    number = "{:.9g}".format
+    rows = [" ".join(map(number, row)) + "\n" for row in nominal_mount().matrix()]
     write_bytes(out / "rough.txt", "".join(rows).encode())
     truth = {
         "gripper_from_camera": pose_to_dict(cell.truth.gripper_from_camera),

@@ -93,13 +93,14 @@ def thing_surfaces(seed: int, base_from_gripper: SE3) -> list[Surface]:
     rotation = base_from_gripper.rotation_matrix()
     surfaces = []
     for thing in _thing(seed):
-        in_base = Surface(
-            corner_m=base_from_gripper.apply(thing.corner_m),
-            edge_u_m=rotation @ thing.edge_u_m,
-            edge_v_m=rotation @ thing.edge_v_m,
-            pyramid=thing.pyramid,
+        surfaces.append(
+            Surface(
+                corner_m=base_from_gripper.apply(thing.corner_m),
+                edge_u_m=rotation @ thing.edge_u_m,
+                edge_v_m=rotation @ thing.edge_v_m,
+                pyramid=thing.pyramid,
+            )
         )
-        surfaces.append(in_base)
     return surfaces
 
 

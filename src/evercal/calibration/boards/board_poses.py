@@ -151,10 +151,9 @@ def board_poses(
                 fit.rms_px,
                 left_out=left_out[name],
             )
-        elif isinstance(view, str):
-            image = BoardImage(name, reason=view)
         else:
-            reason = "the detected corners fit no pose of the board"
+            misfit = "the detected corners fit no pose of the board"
+            reason = view if isinstance(view, str) else misfit
             image = BoardImage(name, reason=reason)
         images.append(image)
     return BoardPoses(

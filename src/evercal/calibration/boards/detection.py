@@ -53,10 +53,7 @@ def find_boards(
     views: dict[str, Detection] = {}
     for tried, i in enumerate(order, 1):
         image = read(names[i])
-        if isinstance(image, str):
-            found[names[i]] = image
-        else:
-            found[names[i]] = _look(image, board)
+        found[names[i]] = image if isinstance(image, str) else _look(image, board)
         last = tried == len(names)
         early = tried <= _MANY_IMAGES and tried % _FEW_IMAGES == 0
         if last or early:

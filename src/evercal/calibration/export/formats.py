@@ -157,9 +157,7 @@ def export_files(
             )
     except InputError as error:
         raise InputError(f"{key}: {error}") from None
-    text = ""
-    if isinstance(content, str):
-        text = content
+    text = content if isinstance(content, str) else ""
     if path is not None:
         files = _write(Path(path), content)
         return Exported(exporter, export.calibration, text, files)

@@ -68,7 +68,7 @@ def _in_own_frame(localizer: "Localizer", name: str) -> "Localizer":
     from evercal.localization.localizer import Localizer
 
     contents = localizer.contents
-    scene = localizer.contents.scene(name)
+    scene = contents.scene(name)
     frame = MapFrame(pose_sigma=scene.frame.pose_sigma)
     scenes = list(contents.scenes)
     scenes[scenes.index(scene)] = replace(scene, frame=frame)

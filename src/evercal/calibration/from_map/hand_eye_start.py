@@ -33,7 +33,7 @@ from evercal.recordings.held_out import require_frames
 from evercal.robot.arm import Arm
 from evercal.robot.arm_offsets import ArmOffsets
 from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount
-from evercal.typing import Array, BoolArray
+from evercal.typing import Array
 
 FRAMES = 120
 """Maximum number of frames, spread by pose."""
@@ -182,7 +182,12 @@ def start_from_matches(
         arm = ArmOffsets.start(joints.arm, mount, best[6:] * joints.arm.free())
     distance = epipolar.medians(best)
     agree = distance < largest
-    _refuse_disagreement(agree)
+    if agree.sum() < max(LEAST_IMAGE_PAIRS, LEAST_SHARE * len(agree)):
+        raise InputError(
+            f"the gripper's motion and the images agree in only {agree.sum()} of {len(agree)} pairs"
+            " of frames: check that the poses belong to these images, that they are poses of the"
+            " gripper in the base (not the inverse), and the order of their quaternions or angles"
+        )
     return HandEyeStart(
         epipolar.transform(best),
         mount,
@@ -192,12 +197,3 @@ def start_from_matches(
         float(np.rad2deg(np.median(distance))),
         arm,
     )
-
-
-def _refuse_disagreement(agree: BoolArray) -> None:
-    if agree.sum() < max(LEAST_IMAGE_PAIRS, LEAST_SHARE * len(agree)):
-        raise InputError(
-            f"the gripper's motion and the images agree in only {agree.sum()} of {len(agree)} pairs"
-            " of frames: check that the poses belong to these images, that they are poses of the"
-            " gripper in the base (not the inverse), and the order of their quaternions or angles"
-        )

@@ -255,13 +255,9 @@ def wrist_jacobian(base_from_gripper: SE3, mount: SE3, scene_m: Array) -> Array:
         scene_m
     )
     jacobian = np.zeros((len(base_from_gripper), 6, 13))
-    jacobian[:, :, :6] = -_of_mount(mount)
+    turned = np.eye(6)
+    turned[:3, :3] = mount.rotation_matrix().T
+    jacobian[:, :, :6] = -turned
     jacobian[:, :, 6:12] = camera_from_scene.adjoint()
     jacobian[:, :3, 12] = -camera_from_scene.translation_m
     return jacobian
-
-
-def _of_mount(pose: SE3) -> Array:
-    turned = np.eye(6)
-    turned[:3, :3] = pose.rotation_matrix().T
-    return turned

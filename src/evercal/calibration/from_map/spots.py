@@ -72,9 +72,7 @@ def from_many_spots(
     parents = fused.select(list(parent_from_scene))
     spots = _spots(cameras)
     count = int(spots.max()) + 1
-    base = base_covariance
-    if base is None:
-        base = np.zeros((6, 6))
+    base = np.zeros((6, 6)) if base_covariance is None else base_covariance
     slopes = np.stack([*map(_by_scene_motion, parents, cameras)])
     by_base = slopes.mean(0) @ base @ slopes.mean(0).T
     whole = mean_covariance(used)

@@ -74,10 +74,9 @@ def _still(greys: Sequence[NDArray[Any]]) -> tuple[BoolArray, BoolArray]:
     means = [cv2.blur(image, size) for image in images]
     variances = np.maximum([_raw_variance(image) for image in images], 0)
     # Most of two images is equal but for the noise.
-    changes = []
-    for before, after in itertools.pairwise(images):
-        changes.append(float(np.median(_raw_variance(after - before))) / 2)
-    noise = max(float(np.median(changes)), LEAST_NOISE**2)
+    pairs = itertools.pairwise(images)
+    changes = [float(np.median(_raw_variance(b - a))) for a, b in pairs]
+    noise = max(float(np.median(changes)) / 2, LEAST_NOISE**2)
     signals = np.maximum(variances - noise, noise)
     apart = -(-len(images) // COMPARED)
     repeated = np.zeros(variances.shape, np.int16)

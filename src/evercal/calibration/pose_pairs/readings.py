@@ -136,9 +136,8 @@ def _extra_row(poses: SE3, other: SE3) -> int:
     same = steps_rad(other)
     before = np.abs(turned - same)
     after = np.abs(turned[1:] - same[:-1])
-    means = []
-    for k in range(len(poses) - 2):
-        means.append(np.mean([*before[: max(k - 1, 0)], *after[k:]]))
+    rows = range(len(poses) - 2)
+    means = [np.mean([*before[: max(k - 1, 0)], *after[k:]]) for k in rows]
     return int(np.argmin(means))
 
 

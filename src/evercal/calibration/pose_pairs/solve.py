@@ -273,9 +273,7 @@ class _Problem:
             depth = np.pad(length[:, 2:], ((0, 0), (2, 3)))
             extras = extras.with_one("shared depth", depth, SIZE_SIGMA)
         size = np.pad(length, ((0, 0), (0, 3)))
-        sigma = np.inf
-        if self.scale_known:
-            sigma = SIZE_SIGMA
+        sigma = SIZE_SIGMA if self.scale_known else np.inf
         extras = extras.with_one("size", size, sigma)
         if pairs.velocity is not None:
             extras = extras.with_one("clock", np.zeros((len(pairs), 6)), np.inf)

@@ -116,11 +116,9 @@ def begin_bench(
         lock_settings(out / results.SETTINGS, settings)
         _record_strategies(out, options.strategies)
     stored = results.read(out)
-    missing = []
-    for seed, strategy in product(options.seeds, options.strategies):
-        if not _is_complete(stored, strategy, seed, len(scenes)):
-            missing.append((seed, strategy))
-    return missing
+    count = len(scenes)
+    runs = product(options.seeds, options.strategies)
+    return [run for run in runs if not _is_complete(stored, run[1], run[0], count)]
 
 
 def _is_complete(stored: Table, strategy: Strategy, seed: int, scenes: int) -> bool:

@@ -83,9 +83,10 @@ def scene_row(frames: Sequence[metrics.FrameResult]) -> dict[str, object]:
     squared = np.array([frame.squared_mahalanobis for frame in frames])
     wrong = np.array([frame.wrong_scene for frame in frames])
     middle = len(frames) // 2  # a mean of the two middle errors may include infinity
-    within = {}
-    for name, (most_m, most_rad) in WITHIN.items():
-        within[name] = int(((metres < most_m) & (radians < most_rad)).sum())
+    within = {
+        name: int(((metres < most_m) & (radians < most_rad)).sum())
+        for name, (most_m, most_rad) in WITHIN.items()
+    }
     return {
         "scene": frames[0].scene,
         "frames": len(frames),

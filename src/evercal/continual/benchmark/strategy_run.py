@@ -281,9 +281,7 @@ class _NetworkRun(_Run):
 def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOptions:
     if stage.head.centres != "fixed" or stage.fixed_centres_m:
         return stage
-    positions = []
-    for scene in scenes:
-        split = split_held_out(scene.train)
-        positions.append(stated_poses(split.train).translation_m)
+    splits = [split_held_out(scene.train) for scene in scenes]
+    positions = [stated_poses(split.train).translation_m for split in splits]
     centres = combined_centres(positions, stage.head.centres_per_scene, stage.seed)
     return replace(stage, grid_scenes=len(scenes), fixed_centres_m=centres)

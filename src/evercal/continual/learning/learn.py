@@ -88,10 +88,7 @@ def learn_jointly(
     fit = options.fit
     encoder = StageRows(after, options, on_event)
     atlas = after.atlas(options.grid_scenes)
-    buffers = []
-    for recording in recordings:
-        _, buffer = _begun(encoder, atlas, recording)
-        buffers.append(buffer)
+    buffers = [_begun(encoder, atlas, recording)[1] for recording in recordings]
     [head] = after.heads
     _whiten(head, buffers, options.seed)
     batch = fit.batch

@@ -52,11 +52,8 @@ class StageRows:
 
     def remembered(self) -> list[FeatureBuffer]:
         """Encode the keyframes of all scenes that have some: one buffer per scene."""
-        buffers = []
-        for number, keyframes in enumerate(self.scenes.keyframes):
-            if keyframes:
-                buffers.append(self.of_keyframes(number))
-        return buffers
+        keyframes = self.scenes.keyframes
+        return [self.of_keyframes(i) for i, kept in enumerate(keyframes) if kept]
 
     def _encoded(
         self, buffer: FeatureBuffer, frames: Sequence[Frame], plan: EncodePlan

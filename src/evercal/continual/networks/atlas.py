@@ -108,10 +108,9 @@ def combined_centres(
     each scene's base frame; `count` is K of the paper.
     """
     atlas = Atlas(len(positions_m))
-    in_atlas = []
-    for scene in positions_m:
-        cell = atlas.place(scene)
-        in_atlas.append(cell.atlas_from_base.apply(scene))
+    in_atlas = [
+        atlas.place(scene).atlas_from_base.apply(scene) for scene in positions_m
+    ]
     means = camera_clusters(np.concatenate(in_atlas), count, seed)
     return tuple(map(tuple, means.tolist()))
 

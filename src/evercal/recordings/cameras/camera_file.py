@@ -110,10 +110,7 @@ def _entries(data: Fields, around: Fields, name: str) -> Iterator[tuple[str, Fie
     hidden = set(fields)
     if not hidden.isdisjoint(DISTORTION):
         hidden.update(DISTORTION)
-    inherited = {}
-    for key, value in around.items():
-        if key not in hidden:
-            inherited[key] = value
+    inherited = {key: value for key, value in around.items() if key not in hidden}
     matrix = fields.get("camera_matrix")
     if "fx" in fields or isinstance(matrix, list | dict):
         yield name, {**inherited, **data}

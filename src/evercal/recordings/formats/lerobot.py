@@ -66,8 +66,11 @@ def _load(root: Path, options: ReadOptions) -> Recording:
         raise InputError(
             f"{root}: LeRobot datasets hold no intrinsics; give them with `camera`"
         )
-    size = _image_size(info["features"][key])
-    camera = read_camera_of_size(options.camera, size, key)
+    shape = [int(n) for n in info["features"][key]["shape"]]
+    if shape[0] == 3:  # some state channels first
+        shape = shape[1:]
+    height, width = shape[:2]
+    camera = read_camera_of_size(options.camera, (width, height), key)
     column = pose_feature(root, info, options)
     rows, values = _rows(root, column)
     stated, notes = feature_poses(root, info, column, values, options)
@@ -86,14 +89,6 @@ def _load(root: Path, options: ReadOptions) -> Recording:
     frames[0].read_image()
     name = root.resolve().name
     return Recording(name, tuple(frames), (), notes=tuple(notes), arm=stated.arm)
-
-
-def _image_size(feature: Info) -> tuple[int, int]:
-    shape = [int(n) for n in feature["shape"]]
-    if shape[0] == 3:  # some state channels first
-        shape = shape[1:]
-    height, width = shape[:2]
-    return width, height
 
 
 def _info(root: Path) -> Info:

@@ -242,10 +242,7 @@ def row_labels(
         times = number_array(columns[stamp], f"{words[stamp]!r}")
         stamps = in_unit(times, name_and_unit(words[stamp])[1])
     labels = {*_NAMES, *_STAMPS}
-    others = []
-    for i, word in enumerate(plain):
-        if word not in labels and i != name:
-            others.append(i)
+    others = [i for i, word in enumerate(plain) if word not in labels and i != name]
     return names, stamps, others
 
 
