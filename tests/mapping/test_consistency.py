@@ -198,8 +198,8 @@ def test_an_archive_of_a_map_that_no_command_reads(
 
 def test_a_scene_without_files_is_named(root: Path) -> None:
     before = Manifest.read(root)
-    payload = before.payload | {"stages": [*before.payload["stages"], "0009-none"]}
-    write_manifest(root, payload, [*before.files])
+    stages = [*before.payload["stages"], "0009-none"]
+    write_manifest(root, {**before.payload, "stages": stages}, [*before.files])
     refused_everywhere(root, "0009-none/scene.json: is missing")
 
 

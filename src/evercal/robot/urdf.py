@@ -6,6 +6,8 @@ from difflib import get_close_matches
 from typing import NamedTuple
 from xml.parsers import expat
 
+import numpy as np
+
 from evercal.bounds import require_at_most
 from evercal.storage.text_files import naming
 
@@ -27,7 +29,7 @@ _DEFAULTS = {
     "limit upper": "inf",
 }
 """Numbers of a joint, and what they are if they are omitted."""
-_PARTS = {name.partition(" ")[0] for name in (*_ENDS[2:], *_DEFAULTS)}
+_PARTS = {"parent", "child", "origin", "axis", "mimic", "limit"}
 """Elements of a joint that count."""
 _KNOWN = {
     *_ENDS,
@@ -146,8 +148,8 @@ def _joint(element: Element) -> Joint:
         text = element.stated.get(key, default)
         count = len(default.split())
         numbers[key] = [*map(float, text.split())]
-        small = [abs(number) < _MOST for number in numbers[key]]
-        finite = key.startswith("limit") or all(small)
+        largest = float(np.abs(numbers[key]).max(initial=0))  # nan if any of them is
+        finite = key.startswith("limit") or largest < _MOST
         if len(numbers[key]) != count or not finite:
             words = (
                 "one finite number",

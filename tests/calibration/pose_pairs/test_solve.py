@@ -182,8 +182,8 @@ def test_a_camera_far_from_its_gripper_may_have_the_other_mount(
     """It is doubted at 0.4 m, and four times as far as the board is from the base."""
     truth = recording(EXACT, 0)
     pairs = truth.pairs
-    carried = SE3(truth.parent_from_camera.rotation_wxyz, [0, 0, camera_m])
-    board = SE3(truth.fixed_from_board.rotation_wxyz, [board_m, 0, 0])
+    carried = SE3(truth.parent_from_camera.rotation_wxyz, np.array([0, 0, camera_m]))
+    board = SE3(truth.fixed_from_board.rotation_wxyz, np.array([board_m, 0, 0]))
     seen = (pairs.base_from_gripper @ carried).inverse() @ board
     solved = solve(replace(pairs, camera_from_board=seen), "eye_in_hand")
     warnings = solved.checks.to_dict()["warnings"]
