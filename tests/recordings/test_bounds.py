@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from evercal.bounds import VARIABLE, TooLargeError, bounds, reading_a_request
 from evercal.calibration.calibration import read_calibration
@@ -24,6 +25,7 @@ from evercal.recordings import read_image, read_robot_poses, write_image
 from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.formats.video_file import Videos
 from evercal.recordings.images import as_rgb, decode_image, is_readable
+from evercal.recordings.poses import array_files
 from evercal.recordings.streams import stream
 from evercal.storage.text_files import natural_key
 
@@ -298,3 +300,16 @@ def test_wide_pixels_are_converted_in_parts() -> None:
     with frugal(seconds=5, megabytes=0.4):
         grey = as_rgb(wide)
     np.testing.assert_array_equal(grey[..., 0], expected)
+
+
+@pytest.mark.parametrize("status", [-11, None])
+def test_a_matlab_file_that_ends_its_reader_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, status: int | None
+) -> None:
+    """It is read by another process first, here by one that was killed or does not end."""
+    path = tmp_path / "a.mat"
+    savemat(path, {"T": np.repeat(np.eye(4)[None], 3, axis=0)})
+    assert len(read_robot_poses(path)) == 3
+    monkeypatch.setattr(array_files, "status_of", lambda *_, **__: status)
+    with pytest.raises(InputError, match="a damaged MATLAB file; save it again"):
+        read_robot_poses(path)

@@ -9,14 +9,29 @@ from typing import IO, Any
 import numpy as np
 
 from evercal.bounds import require_at_most
+from evercal.processes import status_of
 from evercal.storage.text_files import library_errors
+
+_READ = f"""
+import sys
+from {__name__} import matlab_arrays
+print(flush=True)
+matlab_arrays(open(sys.argv[1], "rb"))
+"""
+"""Program that ends once a MATLAB file is read."""
+_LONGEST_S = 60.0
+"""Time for reading a MATLAB file."""
 
 
 def arrays_as_lists(path: Path) -> Any:
     """An array of NPY as lists, or arrays of NPZ or MAT by name; InputError for damaged files."""
     with path.open("rb") as file, library_errors(f"{path}: no readable arrays"):
         if path.suffix.lower() == ".mat":
-            return _matlab(file)
+            # On a damaged file SciPy may end the process, so another one reads it first.
+            status = status_of(_READ, str(path), seconds=_LONGEST_S)
+            if status is None or status < 0:
+                raise ValueError("a damaged MATLAB file; save it again")
+            return matlab_arrays(file)
         if zipfile.is_zipfile(file):
             with zipfile.ZipFile(file) as archive:
                 count = 0
@@ -34,7 +49,8 @@ def arrays_as_lists(path: Path) -> Any:
         return {key: loaded[key].tolist() for key in loaded.files}
 
 
-def _matlab(file: IO[bytes]) -> dict[str, Any]:
+def matlab_arrays(file: IO[bytes]) -> dict[str, Any]:
+    """Arrays of numbers in a MATLAB file, by name."""
     from scipy.io import loadmat, whosmat
 
     numeric = re.compile("double|single|u?int(8|16|32|64)")
