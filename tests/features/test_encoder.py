@@ -141,9 +141,17 @@ def test_unusable_files_are_refused(tmp_path: Path) -> None:
 
 
 def with_encoder(hall_map: MapContents, encoder: Encoder) -> MapContents:
-    """`hall_map` with another encoder, which has centroids."""
-    encoder.vlad([encoder(image(96, 96)).reshape(-1, encoder.width)])
-    return replace(hall_map, encoder=encoder)
+    """`hall_map` with another encoder, which has centroids, and descriptors of its width."""
+    vlad = encoder.vlad([encoder(image(96, 96)).reshape(-1, encoder.width)])
+    scene = hall_map.scenes[0]
+    descriptors = scene.keyframes.descriptors
+    assert descriptors is not None
+    keyframes = replace(
+        scene.keyframes, descriptors=descriptors[:, : vlad.centroids.size]
+    )
+    return MapContents(
+        encoder, hall_map.short_side, [replace(scene, keyframes=keyframes)]
+    )
 
 
 def test_map_keeps_the_name_of_its_function(

@@ -201,9 +201,7 @@ def test_map_on_disk_gives_the_same_poses(
     hall_map: MapContents,
     tmp_path: Path,
 ) -> None:
-    MapStore(tmp_path / "map", with_scene(hall_map, hall_map.scenes[0])).commit(
-        hall_map.scenes[0], {}
-    )
+    MapStore(tmp_path / "map", hall_map.empty()).commit(hall_map.scenes[0], {})
     opened = Localizer.open(tmp_path / "map")
     for frame, first in list(zip(views, estimates, strict=True))[::6]:
         # Landmarks are stored in single precision.

@@ -91,7 +91,7 @@ def files_in(
     files = []
     for file in folder.glob(glob):
         name = file.name.lower()
-        if name.endswith(end) and not name.startswith(".") and file.is_file():
+        if name.endswith(end) and not name.startswith(".") and not file.is_fifo():
             files.append(file)
     return sorted(files, key=lambda file: natural_key(file.as_posix()))
 
