@@ -247,9 +247,8 @@ def size_in_header(data: Image) -> tuple[int, int]:
     Raises:
         ValueError: The bytes are no image.
     """
-    with suppress(
-        Exception
-    ):  # broken headers raise whatever their format's reader does
+    # Broken headers raise whatever the reader of their format does.
+    with suppress(Exception):
         width, height = imagesize.get(io.BytesIO(data.tobytes()), exif_rotation=False)
         if width > 0 and height > 0:
             return width, height
