@@ -31,8 +31,14 @@ os.environ |= {"OPENBLAS_CORETYPE": "", "MKL_CBWR": ""}
 
 from .chromium import CHROMIUM, chromium
 from .slow import pytest_addoption, pytest_collection_modifyitems, pytest_sessionfinish
+from .windows import windows
 
-__all__ = ("pytest_addoption", "pytest_collection_modifyitems", "pytest_sessionfinish")
+__all__ = (
+    "pytest_addoption",
+    "pytest_collection_modifyitems",
+    "pytest_sessionfinish",
+    "windows",
+)
 
 if TYPE_CHECKING:
     import torch

@@ -105,9 +105,9 @@ def test_workers_import_nothing_from_the_current_folder_and_state_why_they_end(
     ends = {}
     for request in ("kill", "exit"):
         worker = Worker(_begin, [1, 2])  # pyright: ignore[reportArgumentType]
-        assert worker.ask("a")
+        worker.ask("a")
         assert worker.answer() == ([1, 2], "a")
-        assert worker.ask("raise")
+        worker.ask("raise")
         with pytest.raises(KeyError, match="request") as error:
             worker.answer()
         assert "in work" in error.value.__notes__[0]
@@ -131,3 +131,92 @@ def test_the_command_line_imports_nothing_from_the_current_folder(baited: Path) 
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert not list(baited.glob("*.ran"))
+
+
+UNGUARDED = """
+from evercal.processes import Worker, cause_of
+def begin(state):
+    return len
+worker = Worker(begin, bytes(10**6))
+worker.ask("a")
+try:
+    worker.answer()
+except EOFError:
+    print(cause_of(worker.end(patience_s=10.0)))
+"""
+
+
+def test_a_script_that_starts_workers_when_it_is_imported_ends(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(UNGUARDED)
+    environment = {**os.environ, "PYTHONPATH": str(Path(processes.__file__).parents[1])}
+    done = subprocess.run(
+        [sys.executable, script],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=60,
+    )
+    assert "bootstrapping phase" in done.stderr
+    assert "status 1, see the lines above; a script starts workers below" in done.stdout
+
+
+COUNTED = """
+from evercal.cli import main
+from evercal.processes import cores
+count = cores()
+main(["info", "missing"])
+import cv2, numpy, scipy.linalg
+from threadpoolctl import threadpool_info
+print(count, cv2.getNumThreads(), {pool["num_threads"] for pool in threadpool_info()})
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="affinity is set on Linux only")
+def test_threads_are_as_many_as_the_process_may_use() -> None:
+    environment = {**os.environ, "PYTHONPATH": str(Path(processes.__file__).parents[1])}
+    del environment["OMP_NUM_THREADS"]
+    mask = "import os; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])"
+    assert output_of_child(f"{mask}{COUNTED}", environment) == "1 1 {1}"
+    environment["PYTHON_CPU_COUNT"] = "1"
+    assert output_of_child(COUNTED, environment) == "1 1 {1}"
+
+
+def output_of_child(code: str, environment: dict[str, str]) -> str:
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    return done.stdout.strip()
+
+
+@pytest.mark.parametrize(
+    ("quotas", "count"),
+    [
+        ({"": "max 100000", "pod": "max 100000", "pod/app": "200000 100000"}, 2),
+        ({"pod": "150000 100000", "pod/app": "max 100000"}, 2),
+        ({"": "50000 100000"}, 1),
+        ({"pod": "300000 100000", "pod/app": "900000 100000"}, 3),
+        ({"pod": "max 100000"}, 8),
+        ({"pod": "broken"}, 8),
+        ({}, 8),
+    ],
+)
+def test_the_quota_of_a_container_bounds_the_threads(
+    quotas: dict[str, str], count: int, tmp_path: Path, monkeypatch
+) -> None:
+    (tmp_path / "self").mkdir()
+    lines = "1:cpu:/elsewhere\n0::/pod/app\n"
+    (tmp_path / "self" / "cgroup").write_text(lines)
+    for group, quota in quotas.items():
+        (tmp_path / "groups" / group).mkdir(parents=True, exist_ok=True)
+        (tmp_path / "groups" / group / "cpu.max").write_text(f"{quota}\n")
+    monkeypatch.setattr(processes, "_PROC", tmp_path)
+    monkeypatch.setattr(processes, "_CGROUPS", tmp_path / "groups")
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    assert processes.cores() == count
+    monkeypatch.setenv("PYTHON_CPU_COUNT", "1")
+    assert processes.cores() == 1
+    monkeypatch.setenv("PYTHON_CPU_COUNT", "default")
+    monkeypatch.setenv("OMP_NUM_THREADS", "0")
+    assert processes.cores() == count

@@ -4,19 +4,29 @@ Python puts the current folder first on a child's import path, where a recording
 any file. So every child is started here, with `-P` or `PYTHONSAFEPATH`.
 """
 
+import math
 import multiprocessing
 import os
+import shlex
 import signal
 import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnContext
 from multiprocessing.process import parent_process
+from pathlib import Path
 from typing import Any
+
+_COUNTS = ("OMP_NUM_THREADS", "PYTHON_CPU_COUNT")
+"""Variables that bound the number of threads."""
+_CGROUPS = Path("/sys/fs/cgroup")
+"""Files of the groups of processes; in a container, those of its own."""
+_PROC = Path("/proc")
+"""Files of processes."""
 
 
 @contextmanager
@@ -37,14 +47,31 @@ def started_safely(variables: Mapping[str, str] = {}) -> Iterator[SpawnContext]:
 
 
 def cores() -> int:
-    """Processor cores that this process may use; OMP_NUM_THREADS bounds them."""
-    count = os.cpu_count() or 1
-    if hasattr(os, "sched_getaffinity"):
-        count = len(os.sched_getaffinity(0))
-    most = os.environ.get("OMP_NUM_THREADS", "")
-    if most.isdecimal() and int(most):
-        count = min(count, int(most))
-    return count
+    """Processor cores that this process may use, at least 1.
+
+    Its affinity, the quota of its container and the variables in `_COUNTS` bound them.
+    """
+    counts = [os.cpu_count() or 1, *_quotas()]
+    if sys.platform == "linux":
+        counts.append(len(os.sched_getaffinity(0)))
+    for name in _COUNTS:
+        count = os.environ.get(name, "")
+        if count.isdecimal():
+            counts.append(int(count))
+    return min(filter(None, counts))
+
+
+def _quotas() -> Iterator[int]:
+    """Processors' time that cgroups (version 2) grant: of this process, and of those above it."""
+    with suppress(OSError, ValueError):
+        own = (_PROC / "self/cgroup").read_text("utf-8").partition("0::/")[2]
+        folder = _CGROUPS / own.partition("\n")[0]
+        for group in (folder, *folder.parents):
+            file = group / "cpu.max"
+            if file.exists():
+                quota, period = file.read_text("utf-8").split()
+                if quota != "max":
+                    yield math.ceil(int(quota) / int(period))
 
 
 _pools: Any = None
@@ -84,6 +111,13 @@ def python_command(*words: str) -> list[str]:
     return [sys.executable, "-P", *words]
 
 
+def command_line(words: Iterable[str]) -> str:
+    """Words of a command as the shells of this system read them."""
+    if sys.platform == "win32":
+        return subprocess.list2cmdline(words)
+    return shlex.join(words)
+
+
 def status_of(
     code: str, *words: str, seconds: float, environment: Mapping[str, str] | None = None
 ) -> int | None:
@@ -108,7 +142,9 @@ def status_of(
 def output_of(*command: str) -> str:
     """What a program prints; OSError if it is missing or fails."""
     try:
-        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        done = subprocess.run(
+            command, check=True, capture_output=True, encoding="utf-8"
+        )
     except subprocess.CalledProcessError as error:
         raise OSError(error.returncode, error.stderr) from None
     return done.stdout.strip()
@@ -132,18 +168,17 @@ class Worker:
         with started_safely(variables) as context:
             self.answers, theirs = context.Pipe()
             self._process = context.Process(
-                target=_work, args=(theirs, begin, state), daemon=True
+                target=_work, args=(theirs, begin), daemon=True
             )
             self._process.start()
         theirs.close()  # so that the end of the process ends the pipe
+        # Not an argument: `start` would wait for ever if the process ended before it read it all.
+        self.ask(state)
 
-    def ask(self, request: object) -> bool:
-        """Send a request; False if the process has ended."""
-        try:
+    def ask(self, request: object) -> None:
+        """Send a request; `answer` states if the process has ended."""
+        with suppress(OSError):
             self.answers.send(request)
-        except OSError:
-            return False
-        return True
 
     def answer(self) -> Any:
         """The answer, or EOFError if the process has ended; its exceptions are raised here."""
@@ -175,7 +210,10 @@ def first_answers(workers: list[Worker]) -> list[Worker]:
 def cause_of(status: int, times: int = 1) -> str:
     """Why processes ended, in words."""
     if status >= 0:
-        return f"its process ended with status {status}, see the lines above"
+        cause = f"its process ended with status {status}, see the lines above"
+        if status == 1:  # of an exception
+            cause += "; a script starts workers below 'if __name__ == \"__main__\":'"
+        return cause
     name = signal.Signals(-status).name
     cause = f"its process was killed by {name}"
     if times > 1:
@@ -185,12 +223,10 @@ def cause_of(status: int, times: int = 1) -> str:
     return cause
 
 
-def _work(
-    pipe: Connection, begin: Callable[[Any], Callable[[Any], Any]], state: object
-) -> None:
+def _work(pipe: Connection, begin: Callable[[Any], Callable[[Any], Any]]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent ends it
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    work = begin(state)
+    work = begin(pipe.recv())
     while True:
         try:
             request = pipe.recv()

@@ -89,7 +89,16 @@ def info(name: str, mode: int) -> zipfile.ZipInfo:
     return entry
 
 
-OUTSIDE = ("../evil", "a/../../evil", "/etc/evil", "a//b", "./a", "..\\evil", "C:/evil")
+OUTSIDE = (
+    "../evil",
+    "a/../../evil",
+    "/etc/evil",
+    "a//b",
+    "./a",
+    "..\\evil",
+    "C:/evil",
+    "a:b",
+)
 
 
 @pytest.mark.parametrize(

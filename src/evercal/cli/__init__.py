@@ -70,6 +70,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if os.environ.get("EVERCAL_PRECISION") == "float32" and platform.machine() in _X86:
         for name, value in _SAME_ARITHMETIC.items():
             os.environ.setdefault(name, value)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # Its encoding may lack letters of a name; stderr escapes them anyway.
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         command = _parse(words, as_json)
         if not isinstance(command, int):
@@ -160,7 +163,7 @@ def _parse(words: list[str], as_json: bool) -> Any:
     caught = io.StringIO()
     # tyro draws frames only on a stream whose encoding has them.
     shown = io.TextIOWrapper(
-        io.BytesIO(), encoding=sys.stdout.encoding, write_through=True
+        io.BytesIO(), sys.stdout.encoding, "replace", write_through=True
     )
     try:
         with contextlib.redirect_stderr(caught), contextlib.redirect_stdout(shown):

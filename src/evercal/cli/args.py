@@ -13,6 +13,7 @@ from tyro.conf import Positional, arg
 from evercal.bounds import VARIABLE, bounds
 from evercal.cli.console import print_json, print_next, say
 from evercal.errors import InputError
+from evercal.processes import cores
 
 if TYPE_CHECKING:
     from evercal.geometry import SE3, Camera, UncertainPose
@@ -82,9 +83,11 @@ class Verb:
         raise NotImplementedError
 
     def set_limits(self) -> None:
-        """Bound what is read, also in worker processes; called before OpenCV is loaded."""
+        """Bound what is read, and threads, also in worker processes; before OpenCV is loaded."""
         if self.limits:
             os.environ[VARIABLE] = self.limits
+        for name in ("OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+            os.environ.setdefault(name, str(cores()))
         os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(bounds().pixels))
 
     @property

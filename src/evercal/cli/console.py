@@ -2,13 +2,13 @@
 
 import json
 import os
-import shlex
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
 from evercal.errors import InputError, printable, with_options
+from evercal.processes import command_line
 
 
 def say(text: str, file: TextIO | None = None) -> None:
@@ -29,7 +29,7 @@ def print_json(record: object) -> None:
 
 def print_next(*words: object) -> None:
     """Print the command to run next; words in capitals are placeholders."""
-    say("next: " + shlex.join(str(word) for word in words))
+    say("next: " + command_line(map(str, words)))
 
 
 def table(rows: Sequence[Mapping[str, object]]) -> list[str]:

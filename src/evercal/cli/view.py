@@ -1,10 +1,9 @@
 """`evercal view`."""
 
 import contextlib
-import shlex
 import signal
 import socket
-import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -34,7 +33,8 @@ class PageVerb(args.Verb):
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         with contextlib.suppress(KeyboardInterrupt):
             self.answer({"url": url}, f"{words}; Ctrl-C ends it")
-            threading.Event().wait()
+            while True:
+                time.sleep(1.0)  # Ctrl-C does not end a wait without end on Windows
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,7 @@ class View(PageVerb):
                 page.track(self.live, self.camera)
             url = page.server.url
             port = page.server.get_port()
-            tunnel = shlex.join(
-                ["ssh", "-L", f"{port}:127.0.0.1:{port}", socket.gethostname()]
-            )
+            tunnel = f"ssh -L {port}:127.0.0.1:{port} {socket.gethostname()}"
             self.wait(
                 url, f"view of {self.store} at {url} (from another machine: {tunnel})"
             )

@@ -220,7 +220,7 @@ def _plain(record: SceneRecord) -> dict[str, Any]:
 
 
 def _read_record(folder: Path) -> SceneRecord:
-    content = json.loads((folder / RECORD).read_text())
+    content = json.loads((folder / RECORD).read_bytes())
     checked_name(content["name"])
     cell = content["cell"]
     content["cell"] = Cell(

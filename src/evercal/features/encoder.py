@@ -181,9 +181,14 @@ class _OnnxNetwork:
                 file.write_bytes(self.data)
             level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
             try:
-                for engine in (cv2.dnn.ENGINE_CLASSIC, cv2.dnn.ENGINE_AUTO):
+                for source, engine in (
+                    (str(file), cv2.dnn.ENGINE_CLASSIC),
+                    (str(file), cv2.dnn.ENGINE_AUTO),
+                    # On Windows OpenCV opens no file whose path is not ASCII.
+                    (np.frombuffer(self.data, np.uint8), cv2.dnn.ENGINE_AUTO),
+                ):
                     try:
-                        return cv2.dnn.readNetFromONNX(str(file), engine=engine)
+                        return cv2.dnn.readNetFromONNX(source, engine=engine)
                     except cv2.error as error:
                         words = str(error).split()
                         reason = " ".join(words)[:200]
@@ -213,14 +218,14 @@ def load_encoder(
             f"encoder {source!r}: give an ONNX file or a function on arrays"
         )
     if stored is not None and stored.suffix == ".json":
-        record = json.loads(stored.read_text())
+        record = json.loads(stored.read_bytes())
         encoder.require_same(record, stored)
     return encoder
 
 
 def _of_file(path: Path) -> Encoder:
     if path.suffix == ".json":
-        record = json.loads(path.read_text())
+        record = json.loads(path.read_bytes())
         name = record["function"]
         raise InputError(
             f"{path}: the map was made with the function {name!r}; give it as encoder"

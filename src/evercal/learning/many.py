@@ -76,10 +76,8 @@ def _in_turn(
                 worker = (
                     idle.pop() if idle else Worker(_begin, state, _few_threads(threads))
                 )
-                if worker.ask(waiting[0]):
-                    busy[worker] = waiting.pop(0)
-                else:  # killed while it waited
-                    worker.end()
+                worker.ask(waiting[0])
+                busy[worker] = waiting.pop(0)
             for worker in first_answers([*busy]):
                 item = busy.pop(worker)
                 try:

@@ -20,6 +20,7 @@ from evercal.recordings.frame import Frame, stated_grippers
 from evercal.recordings.images import write_jpeg
 from evercal.recordings.read_options import ReadOptions
 from evercal.storage import write_bytes, write_json
+from evercal.storage.text_files import is_link
 from evercal.typing import Image
 
 POSES = "base_from_gripper.csv"
@@ -95,7 +96,7 @@ class WristRecorder:
 
 def require_own(folder: Path) -> None:
     """Refuse a folder that is a link: files that are removed there may be another recording's."""
-    if folder.is_symlink():
+    if is_link(folder):
         raise InputError(f"{folder}: is a link; use a new folder")
 
 

@@ -264,7 +264,7 @@ def write_scene(folder: Path, scene: SceneMap) -> None:
 def refreshes(folder: Path) -> list[dict[str, Any]]:
     """Reports of the refreshes of a scene, oldest first."""
     file = folder / REFRESHES
-    return json.loads(file.read_text())["refreshes"] if file.exists() else []
+    return json.loads(file.read_bytes())["refreshes"] if file.exists() else []
 
 
 def _move(source: Path, target: Path) -> None:
@@ -292,7 +292,7 @@ def read_scene(folder: Path) -> SceneMap:
 
 
 def _read_scene(folder: Path) -> SceneMap:
-    content = json.loads((folder / SCENE).read_text())
+    content = json.loads((folder / SCENE).read_bytes())
     correction = None
     if (folder / CORRECTION).exists():
         correction = correction_of(load_tensors(folder / CORRECTION))

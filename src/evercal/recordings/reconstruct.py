@@ -186,7 +186,8 @@ def _match(pycolmap: Any, root: Path, names: list[str]) -> None:
     spread = np.linspace(0, len(names) - 1, _EXHAUSTIVE).round().astype(int)
     pairs = itertools.combinations([names[i] for i in spread], 2)
     file = root / "pairs.txt"
-    file.write_text("".join(f"{first} {second}\n" for first, second in pairs))
+    lines = "".join(f"{first} {second}\n" for first, second in pairs)
+    file.write_text(lines, encoding="utf-8")
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = file
     pycolmap.match_image_pairs(database, pairing_options=pairing)

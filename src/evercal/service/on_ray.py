@@ -100,7 +100,8 @@ def serve_on_ray(
                     f"{options.map}: machines of the cluster do not reach this folder"
                 )
             on_ready(url, scenes)
-            stop.wait()
+            while not stop.wait(1.0):  # without end, Ctrl-C does not end it on Windows
+                pass
         except RuntimeError as error:
             raise InputError(f"`ray` {address}: {error}") from None
         finally:

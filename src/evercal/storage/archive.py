@@ -170,8 +170,8 @@ def _stays_inside(name: str) -> bool:
     parts = name.removesuffix("/").split("/")
     if any(part in ("", ".", "..") or len(part.encode()) > 255 for part in parts):
         return False
-    has_drive = parts[0][1:2] == ":"
-    return not has_drive and set(name).isdisjoint("\\\0") and len(name) <= 1024
+    # A colon begins a drive or a stream of a file on Windows.
+    return set(name).isdisjoint("\\:\0") and len(name) <= 1024
 
 
 def _extract(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path) -> None:

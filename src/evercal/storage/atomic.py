@@ -8,12 +8,17 @@ import contextlib
 import json
 import os
 import shutil
+import sys
+import time
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from evercal.typing import PathLike
+
+_PATIENCE_S = {"win32": 2.0}.get(sys.platform, 0.0)
+"""Time for other programs to close a file, seconds: Windows renames nothing that is open."""
 
 
 def write_bytes(path: PathLike, data: bytes) -> None:
@@ -50,7 +55,7 @@ def replacing(path: PathLike) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+        _rename(temporary, path)
     except BaseException:
         with contextlib.suppress(OSError):
             temporary.unlink()
@@ -84,9 +89,9 @@ def replace_folder(temporary: PathLike, final: PathLike) -> None:
     recover_folder(final)
     aside = _aside(final)
     if final.exists():
-        os.replace(final, aside)
+        _rename(final, aside)
     try:
-        os.replace(temporary, final)
+        _rename(temporary, final)
     except BaseException:
         recover_folder(final)
         raise
@@ -104,8 +109,20 @@ def recover_folder(final: PathLike) -> None:
     if final.exists():
         shutil.rmtree(aside)
     else:
-        os.replace(aside, final)
+        _rename(aside, final)
     _sync_folder(final.parent)
+
+
+def _rename(source: Path, target: Path) -> None:
+    last = time.monotonic() + _PATIENCE_S
+    while True:
+        try:
+            return os.replace(source, target)
+        except PermissionError as error:
+            error.filename = str(target)
+            if time.monotonic() >= last:
+                raise
+        time.sleep(_PATIENCE_S / 100)
 
 
 def _aside(final: Path) -> Path:
@@ -113,7 +130,8 @@ def _aside(final: Path) -> Path:
 
 
 def _sync(file: Path) -> None:
-    with naming_file(file), open(file, "rb") as handle:
+    # Windows syncs no file that is open for reading only.
+    with naming_file(file), open(file, "r+b") as handle:
         os.fsync(handle.fileno())
 
 

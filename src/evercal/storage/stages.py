@@ -17,7 +17,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -27,7 +27,7 @@ from filelock import FileLock, Timeout
 from evercal.errors import InputError
 from evercal.storage.atomic import replace_folder, write_json
 from evercal.storage.manifest import MANIFEST, Manifest, write_manifest
-from evercal.storage.text_files import read_json
+from evercal.storage.text_files import is_link, read_json
 
 SCHEMA = 6
 """Version of the files of a store."""
@@ -78,7 +78,7 @@ def require_free(root: Path) -> None:
 def _require_no_links(root: Path) -> None:
     """Refuse folders that lie elsewhere: what a change removes there may be another map's."""
     for folder in (root / STAGES, *(root / STAGES).glob("*")):
-        if folder.is_symlink():
+        if is_link(folder):
             raise InputError(
                 f"store {root}: {folder} is a link; copy the whole map instead"
             )
@@ -232,7 +232,7 @@ class StageStore(Generic[Contents]):
             for name, write in added:
                 number += 1
                 made = number
-                legal = re.sub(r"[^\w.-]", "_", name)[:60]
+                legal = re.sub(r"[^\w.-]|[.]$", "_", name[:60])
                 new[f"{number:04d}-{legal}"] = write
             settings = {**payload, _MADE: made}
             self._publish([*kept, *new], new, settings, before, superseded)
@@ -307,8 +307,10 @@ class StageStore(Generic[Contents]):
         superseded: Superseded,
     ) -> None:
         self.root.mkdir(parents=True, exist_ok=True)
-        dropped = [stage for stage in self.stages if stage not in stages]
-        write_json(self.root / _JOURNAL, {"new": [*new], "dropped": dropped})
+        # Those of earlier changes may still be open: Windows then removes nothing.
+        dropped = {*self.stages, *_left(self.root, self.stages)}.difference(stages)
+        journal = {"new": [*new], "dropped": sorted(dropped)}
+        write_json(self.root / _JOURNAL, journal)
         for stage, write in new.items():
             self.folder(f".{stage}").mkdir(parents=True)
             write(self.folder(f".{stage}"))
@@ -335,7 +337,7 @@ def _tidy(root: Path) -> None:
     """Remove what a change has dropped, or has left because it was refused or killed."""
     manifest = _manifest(root)
     stages = manifest.payload["stages"]
-    left = {*_journal(root, "new"), *_journal(root, "dropped")}.difference(stages)
+    left = _left(root, stages)
     for name in _names(root / STAGES):
         folder = root / STAGES / name
         is_unfinished = name.startswith(".") and _STAGE.fullmatch(name[1:])
@@ -349,8 +351,14 @@ def _tidy(root: Path) -> None:
     with suppress(OSError):
         for unfinished in root.glob(".*.tmp"):
             unfinished.unlink()
-        if not left & _names(root / STAGES):
+        if not _left(root, stages):
             (root / _JOURNAL).unlink()
+
+
+def _left(root: Path, stages: Iterable[str]) -> set[str]:
+    """Folders of stages that a change has dropped, or has left without finishing."""
+    written = {*_journal(root, "new"), *_journal(root, "dropped")}
+    return written.difference(stages) & _names(root / STAGES)
 
 
 def _manifest(root: Path) -> Manifest:

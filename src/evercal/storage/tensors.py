@@ -4,6 +4,7 @@ import errno
 import io
 import json
 import os
+import sys
 import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -20,6 +21,8 @@ from evercal.storage.atomic import write_bytes
 
 _LENGTH = 8
 """Bytes of the length of a header, which stands before it."""
+_MOST_FILES_MACOS = 10_240
+"""OPEN_MAX of macOS, which refuses a higher limit even where it states none."""
 _KINDS = {
     "BOOL": "?",
     "U8": "u1",
@@ -144,12 +147,21 @@ def _opened(path: Path) -> io.FileIO:
     except OSError as error:
         if error.errno != errno.EMFILE:
             raise
-    import resource  # not on every system
-
-    # A map has as many files as scenes.
-    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    _open_more_files()
     return path.open("rb", buffering=0)
+
+
+def _open_more_files() -> None:
+    """Raise the limit of open files: a map has as many as scenes. Windows opens 8,192 anyway."""
+    if sys.platform == "win32":
+        return
+    import resource
+
+    kind = resource.RLIMIT_NOFILE
+    _, most = resource.getrlimit(kind)
+    if sys.platform == "darwin":
+        most = min(most, _MOST_FILES_MACOS)
+    resource.setrlimit(kind, (most, most))
 
 
 @contextmanager

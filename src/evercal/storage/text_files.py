@@ -198,6 +198,11 @@ def path_inside(path: object, what: str) -> str:
     return relative.as_posix()
 
 
+def is_link(folder: Path) -> bool:
+    """Whether a folder lies elsewhere, also by a junction of Windows."""
+    return folder.resolve() != folder.parent.resolve() / folder.name
+
+
 def is_real(value: object) -> bool:
     """Whether a JSON value is a number."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
