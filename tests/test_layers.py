@@ -266,7 +266,6 @@ def test_import_is_fast_and_provides_every_public_name() -> None:
         "scipy",
         "matplotlib",
         "pandas",
-        "poselib",
         "tyro",
         "numpy",
     }

@@ -157,6 +157,6 @@ def test_sift_clears_frames_that_the_encoder_suspects(
     assert check_poses(recording, suspicious(recording)).excluded.tolist() == []
     far = moved(recording, {6: SE3.exp(np.array([0, 0.3, 0, 0, 0, 0]))})
     assert check_poses(far, suspicious(far)).wrong.tolist() == [6]
-    monkeypatch.setattr("evercal.mapping.pose_check.epipolar_pair", lambda *_: None)
+    monkeypatch.setattr("evercal.mapping.pose_check.epipolar_rays", lambda *_: None)
     check = check_poses(recording, suspicious(recording))
     assert (check.wrong.tolist(), check.untracked.tolist()) == ([], [6])

@@ -1,13 +1,13 @@
-"""SIFT matches of two images that one essential matrix explains, and the camera motion.
+"""SIFT matches of two images that one essential matrix explains.
 
 SIFT's ratio test leaves repeated texture out, and the essential matrix tests the rest. Few matches
 remain, but they are right where the encoder's cells mistake one square of a board for another.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from evercal.geometry import Camera
 from evercal.typing import Array, Float32Array, Image, IntArray
@@ -20,6 +20,8 @@ RATIO = 0.85
 """Maximum ratio of distances in Lowe's test."""
 EPIPOLAR_PX = 1.0
 """Maximum distance of an inlier from its epipolar line, pixels."""
+ITERATIONS = 1000
+"""Maximum number of samples for an essential matrix."""
 MIN_INLIERS = 20
 """Minimum number of inliers of a pair of images."""
 
@@ -32,18 +34,6 @@ class SiftFeatures:
     """(n, 2)."""
     descriptors: Float32Array
     """(n, 128) of unit length, RootSIFT (Arandjelovic and Zisserman, CVPR 2012)."""
-
-
-@dataclass(frozen=True, eq=False)
-class EpipolarPair:
-    """Motion of the camera between two images, and the matches that agree with it."""
-
-    rotation: Rotation
-    """second_camera_from_first_camera."""
-    direction: Array
-    """(3,) unit vector of its translation."""
-    rays: Array
-    """(2, n, 3) rays of the inliers in both camera frames, at depth 1."""
 
 
 def sift_features(image: Image) -> SiftFeatures:
@@ -63,58 +53,45 @@ def sift_features(image: Image) -> SiftFeatures:
     return SiftFeatures(pixels, np.sqrt(shares))
 
 
-def epipolar_pair(
+def epipolar_rays(
     a: SiftFeatures,
     b: SiftFeatures,
     first: Camera,
     second: Camera,
     least_px: float = 0.0,
-) -> EpipolarPair | None:
-    """Match two images and estimate the camera's motion; None for fewer than `MIN_INLIERS`.
+) -> Array | None:
+    """Matches of two images that one essential matrix explains; None for fewer than `MIN_INLIERS`.
 
+    They are rays (2, n, 3) at depth 1, in the frames of both cameras.
     Matches that move by less than `least_px` in the image do not count.
     """
-    import poselib
+    import cv2
 
     if min(len(a.pixels), len(b.pixels)) < MIN_INLIERS:
         return None
     rows, matched = _distinct_matches(a.descriptors, b.descriptors)
     pixels_a = a.pixels[rows]
     pixels_b = b.pixels[matched]
-    # Undistorted here, so that PoseLib needs no camera model.
-    ideal_a = first.unproject(pixels_a)[:, :2] * first.fx
-    ideal_b = second.unproject(pixels_b)[:, :2] * second.fx
+    rays = np.stack([first.unproject(pixels_a), second.unproject(pixels_b)])
     moved_px = np.linalg.norm(pixels_a - pixels_b, axis=1)
-    valid = np.isfinite(ideal_a + ideal_b).all(1)
-    valid &= moved_px >= least_px
+    valid = np.isfinite(rays).all((0, 2)) & (moved_px >= least_px)
+    rays = rays[:, valid]
     if valid.sum() < MIN_INLIERS:
         return None
-    ideal_a = ideal_a[valid]
-    ideal_b = ideal_b[valid]
-    pose, info = poselib.estimate_relative_pose(
-        ideal_a,
-        ideal_b,
-        _ideal(first),
-        _ideal(second),
-        {"max_epipolar_error": EPIPOLAR_PX},
-        {},
+    parameters = cv2.UsacParams()
+    parameters.threshold = EPIPOLAR_PX / math.sqrt(first.fx * second.fx)
+    parameters.maxIterations = ITERATIONS
+    parameters.score = cv2.SCORE_METHOD_MSAC
+    parameters.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    # Rays of a pinhole with focal length 1.
+    plane_a, plane_b = rays[:, :, :2]
+    unit = np.eye(3)
+    _, mask = cv2.findEssentialMat(
+        plane_a, plane_b, unit, unit, None, None, params=parameters
     )
-    if info["num_inliers"] < MIN_INLIERS:
+    if mask is None or np.count_nonzero(mask) < MIN_INLIERS:
         return None
-    length = float(np.linalg.norm(pose.t))
-    direction = np.asarray(pose.t) / max(length, 1e-12)
-    inliers = np.asarray(info["inliers"], bool)
-    inliers = np.flatnonzero(inliers)
-    plane_a = ideal_a[inliers] / first.fx
-    plane_b = ideal_b[inliers] / second.fx
-    rays = np.ones((2, len(inliers), 3))
-    rays[0, :, :2] = plane_a
-    rays[1, :, :2] = plane_b
-    return EpipolarPair(
-        rotation=Rotation.from_matrix(pose.R),
-        direction=direction,
-        rays=rays,
-    )
+    return rays[:, mask.ravel() > 0]
 
 
 def _distinct_matches(a: Float32Array, b: Float32Array) -> tuple[IntArray, IntArray]:
@@ -133,12 +110,3 @@ def _distinct_matches(a: Float32Array, b: Float32Array) -> tuple[IntArray, IntAr
     distinct = nearest < RATIO**2 * next_nearest
     good = np.flatnonzero(mutual & distinct)
     return good, best[good]
-
-
-def _ideal(camera: Camera) -> dict[str, object]:
-    return {
-        "model": "SIMPLE_PINHOLE",
-        "width": 1,
-        "height": 1,
-        "params": [camera.fx, 0.0, 0.0],
-    }

@@ -35,7 +35,7 @@ _HOPELESS = 0.08
 """Share of the searched landmarks that must agree; with fewer the search ends."""
 _FAR_PX = 1.0
 """Shift above which the coarse round is repeated, pixels."""
-_LOOSE_PNP = PnpOptions(threshold_px=4.0, max_iterations=200, min_iterations=20)
+_LOOSE_PNP = PnpOptions(threshold_px=4.0, max_iterations=200)
 """RANSAC settings for the matches of the coarse round, many of which are wrong."""
 
 

@@ -1,21 +1,28 @@
-"""Pose from 2D-3D matches: PoseLib's LO-RANSAC with a cap, and the covariance of the pose."""
+"""Pose from 2D-3D matches by OpenCV's RANSAC, and the covariance of the pose."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from evercal.errors import require_numbers
 from evercal.geometry import SE3, Camera, UncertainPose, in_parent_axes
-from evercal.localization.pose_refinement import linearise
+from evercal.localization.pose_refinement import Pose, linearise
 from evercal.typing import Array, BoolArray
 
 MIN_INLIERS = 6
 """Inliers of a pose by PnP, at least."""
 _MISS_PROBABILITY = 1e-3
 """Probability that RANSAC misses a pose with `PnpOptions.sought_inliers`."""
+_STEPS = 4
+"""Gauss-Newton steps that refine a pose."""
+_NEAR = 1.5
+"""Factor on the threshold for matches that refine a pose: a pose of three matches is rough."""
+_RIDGE = 1e-6
+"""Ridge of the information, pixels squared: without matches there is no step."""
 
 
 @dataclass(frozen=True)
@@ -24,10 +31,8 @@ class PnpOptions:
 
     threshold_px: float = 5.0
     """Reprojection error below which a match is an inlier, pixels at working size."""
-    max_iterations: int = 1000
+    max_iterations: int = 700
     """Maximum number of iterations, for images without any consistent sample."""
-    min_iterations: int = 100
-    """Iterations that always run."""
     sought_inliers: int = 12
     """RANSAC finds a pose with this many inliers with a probability of 99.9 %."""
     progressive_sampling: bool = False
@@ -35,7 +40,7 @@ class PnpOptions:
     2005)."""
 
     def __post_init__(self) -> None:
-        counts = ("max_iterations", "min_iterations", "sought_inliers")
+        counts = ("max_iterations", "sought_inliers")
         require_numbers(self, counts, 1)
         require_numbers(self, ("threshold_px",), 0)
 
@@ -61,30 +66,54 @@ def solve_pnp(
 
     Pixels (n, 2) lie in the ideal pinhole of the camera, whose distortion is ignored.
     """
-    import poselib
-
-    # PoseLib does not use the image size of a PINHOLE camera.
-    parameters = [camera.fx, camera.fy, camera.cx, camera.cy]
-    pinhole = {"model": "PINHOLE", "width": 0, "height": 0, "params": parameters}
-    # Samples of three until one is of inliers only: few matches need few.
-    share = min(options.sought_inliers / max(len(pixels), 1), 0.9)
-    needed = math.log(_MISS_PROBABILITY) / math.log1p(-(share**3))
-    needed = max(needed, options.min_iterations)
-    ransac = {
-        "max_reproj_error": options.threshold_px,
-        "max_iterations": int(min(needed, options.max_iterations)),
-        "min_iterations": options.min_iterations,
-        # The default multiplies the number of iterations that the inlier ratio asks for by three.
-        "dyn_num_trials_mult": 1.0,
-        "progressive_sampling": options.progressive_sampling,
-    }
-    pose, info = poselib.estimate_absolute_pose(pixels, points_m, pinhole, ransac, {})
-    inliers = np.asarray(info["inliers"], bool)
-    enough = len(inliers) == len(pixels) and inliers.sum() >= MIN_INLIERS
-    if not enough or not np.isfinite(pose.t).all():
+    if len(pixels) < MIN_INLIERS:
         return None
-    camera_from_points = SE3(np.asarray(pose.q, float), np.asarray(pose.t, float))
-    return PnpResult(camera_from_points.inverse(), inliers)
+    # Samples of three until one is of inliers only: few matches need few.
+    share = min(options.sought_inliers / len(pixels), 0.9)
+    needed = math.log(_MISS_PROBABILITY) / math.log1p(-(share**3))
+    parameters = cv2.UsacParams()
+    parameters.confidence = 1 - _MISS_PROBABILITY
+    parameters.maxIterations = math.ceil(min(needed, options.max_iterations))
+    parameters.threshold = options.threshold_px
+    parameters.score = cv2.SCORE_METHOD_RANSAC
+    if options.progressive_sampling:
+        parameters.sampler = cv2.SAMPLING_PROSAC
+    # OpenCV's own refinement takes three times as long as the steps below.
+    parameters.loMethod = cv2.LOCAL_OPTIM_NULL
+    parameters.final_polisher = cv2.NONE_POLISHER
+    focal = np.diag([camera.fx, camera.fy, 1.0])
+    focal[:2, 2] = camera.cx, camera.cy
+    solved, _, turn, shift, _ = cv2.solvePnPRansac(
+        points_m, pixels, focal, None, params=parameters
+    )
+    if not solved:
+        return None
+    rotation = np.asarray(cv2.Rodrigues(turn)[0], np.float64).T
+    start = rotation, -rotation @ np.asarray(shift, np.float64).ravel()
+    return _refined(pixels, points_m, camera.pinhole, start, options.threshold_px)
+
+
+def _refined(
+    pixels: Array, points_m: Array, pinhole: Camera, start: Pose, threshold_px: float
+) -> PnpResult | None:
+    """The pose after Gauss-Newton steps with the matches near it; None for few inliers."""
+    rotation, position = start
+    for _ in range(_STEPS):
+        error, slope = linearise(pixels, points_m, rotation, position, pinhole)
+        near = (error**2).sum(0) < (_NEAR * threshold_px) ** 2
+        rows = (slope * near).reshape(6, -1)
+        information = rows @ rows.T + _RIDGE * np.eye(6)
+        step = -np.linalg.solve(information, rows @ error.ravel())
+        position = position + rotation @ step[:3]
+        rotation = rotation @ cv2.Rodrigues(step[3:])[0]
+    error, _ = linearise(pixels, points_m, rotation, position, pinhole)
+    inliers = (error**2).sum(0) < threshold_px**2
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = position
+    if inliers.sum() < MIN_INLIERS or not np.isfinite(matrix).all():
+        return None
+    return PnpResult(SE3.from_matrix(matrix), inliers)
 
 
 def most_inliers(

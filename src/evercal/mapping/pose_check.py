@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from evercal.features.sift import SiftFeatures, epipolar_pair, sift_features
+from evercal.features.sift import SiftFeatures, epipolar_rays, sift_features
 from evercal.features.views import cell_centres, ideal_cell_pixels
 from evercal.features.vlad import Vlad, similar_pairs
 from evercal.geometry import Camera
@@ -148,11 +148,11 @@ class _SiftCheck:
 
     def _pair(self, i: int, j: int) -> MatchedPair | None:
         cameras = self.recording.cameras
-        matches = epipolar_pair(self._of(i), self._of(j), cameras[i], cameras[j])
-        if matches is None:
+        rays = epipolar_rays(self._of(i), self._of(j), cameras[i], cameras[j])
+        if rays is None:
             return None
         camera = self.recording.cell_camera(j).pinhole
-        return MatchedPair(i, j, matches.rays[0], camera.project(matches.rays[1]))
+        return MatchedPair(i, j, rays[0], camera.project(rays[1]))
 
     def _of(self, frame: int) -> SiftFeatures:
         if frame not in self._features:

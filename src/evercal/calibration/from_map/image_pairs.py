@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from evercal.features.encoder import Encoder
-from evercal.features.sift import epipolar_pair, sift_features
+from evercal.features.sift import epipolar_rays, sift_features
 from evercal.features.views import working_image
 from evercal.features.vlad import similar_pairs
 from evercal.geometry import Camera
@@ -69,12 +69,12 @@ def image_pairs(
 
         def matched(pair: tuple[int, int]) -> ImagePair | None:
             i, j = pair
-            matches = epipolar_pair(
+            rays = epipolar_rays(
                 points[i], points[j], cameras[i], cameras[j], least_motion_px
             )
-            if matches is None:
+            if rays is None:
                 return None
-            return ImagePair(i, j, matches.rays)
+            return ImagePair(i, j, rays)
 
         for done, pair in enumerate(pool.map(matched, candidates), start=1):
             if pair is not None:
