@@ -74,6 +74,21 @@ def test_few_right_matches_among_the_first_are_sampled(seed: int) -> None:
     assert far[0] < 0.1 < far[1]
 
 
+def test_many_outliers_leave_the_pose_accurate() -> None:
+    errors_m = []
+    for seed in range(12):
+        truth, pixels, points = case(seed, 300)
+        rng = np.random.default_rng(seed)
+        wrong = rng.random(300) < 0.7
+        pixels[wrong] = rng.uniform([0, 0], [319, 239], (wrong.sum(), 2))
+        noisy = pixels + rng.normal(0, 1.0, pixels.shape)
+        result = solve_pnp(noisy, points, CAMERA, PnpOptions())
+        assert result is not None
+        errors_m.append(pose_distance(result.pose, truth)[0])
+    # Without refinement the median is 8 mm.
+    assert np.median(errors_m) < 0.005
+
+
 @pytest.mark.parametrize("count", [0, 3, 5])
 def test_too_few_points_give_none(count: int) -> None:
     _, pixels, points = case(0, count)
