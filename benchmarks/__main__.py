@@ -55,6 +55,7 @@ VERBS = {
     "cluster": ("cluster", "learning and serving on a Ray cluster, beside one process"),
     "mutants": ("mutants", "small changes of the code that the tests should notice"),
     "networks": ("networks", "the experiments on networks; the paper's table on a GPU"),
+    "wheels": ("wheels", "what lacks wheels on the platforms of docs/install.md"),
     "tables": ("tables", "print the tables of the docs from results/"),
 }
 """Module and summary of every verb."""

@@ -1,14 +1,16 @@
-"""Without an optional package, the error names the command that installs it."""
+"""Without an optional package, the error names the command that installs it, or another way."""
 
+import platform
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from evercal.recordings.formats import colmap, lerobot
+from evercal.recordings.formats import lerobot
 from evercal.recordings.formats.bags.file import BagFile
 from evercal.recordings.formats.video_file import Videos
+from evercal.recordings.reconstruct import reconstruct
 
 from .checks import refused
 
@@ -16,7 +18,7 @@ from .checks import refused
 @pytest.mark.parametrize(
     ("module", "extra", "read"),
     [
-        ("pycolmap", "colmap", colmap._model),
+        ("pycolmap", "colmap", lambda path: reconstruct(path, path / "out")),
         ("rosbags.highlevel", "bags", BagFile),
         ("pyarrow.parquet", "lerobot", lambda path: lerobot._columns(path, [])),
         ("av", "lerobot", lambda _: Videos(30.0)),
@@ -31,3 +33,13 @@ def test_missing_extra_names_the_install_command(
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     refused(rf"constraints.txt '\.\[{extra}\]'", read, tmp_path)
+
+
+def test_where_a_package_has_no_wheels_the_error_names_another_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    monkeypatch.setattr(platform, "system", lambda: "Linux")
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    message = "no wheel for Linux aarch64: .*apt-get install colmap.*another computer"
+    refused(message, reconstruct, tmp_path, tmp_path / "out")

@@ -110,8 +110,6 @@ def recording(page: Path, name: str) -> Recording:
 
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_recordings(page: Path, name: str) -> None:
-    if name == "house":
-        pytest.importorskip("pycolmap", reason="the extra 'colmap' is not installed")
     read = recording(page, name)
     assert (len(read.train), len(read.test)) == RECORDINGS[name][1:]
     for frame in (*read.train, *read.test):

@@ -1,5 +1,6 @@
 """COLMAP models written by pycolmap: projections agree with pycolmap."""
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -141,11 +142,47 @@ def test_other_models_are_refused_by_name(
 
 def test_broken_files_are_refused(tmp_path: Path) -> None:
     make(tmp_path)
-    file = tmp_path / "sparse/0/images.bin"
-    file.write_bytes(file.read_bytes()[:50])
-    refused("pycolmap cannot read the model", load_recording, tmp_path)
+    for name in ("images.bin", "cameras.bin"):
+        file = tmp_path / "sparse/0" / name
+        data = file.read_bytes()
+        for damaged in (data[:50], data[:-1], data[:7], data + b"\0"):
+            file.write_bytes(damaged)
+            refused(f"{name}: ends early or holds more", load_recording, tmp_path)
+        file.write_bytes(data)
     (tmp_path / "none/sparse/0").mkdir(parents=True)
     refused("no COLMAP model", load_recording, tmp_path / "none", format="colmap")
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("cameras", "1 PINHOLE 64 48 51", "1 PINHOLE 64 48", r"\['fx', .* got 3"),
+        ("cameras", "1 PINHOLE 64 48 51", "1 PINHOLE", "cameras.txt: .* got 1"),
+        ("cameras", "1 PINHOLE", "1 PINHALL", "PINHALL is not supported"),
+        ("cameras", "1 PINHOLE 64", "3 PINHOLE 64", "camera 1 has no entry"),
+        ("images", "sub/image-9.png", "", "images.txt: '2 .*' is not IMAGE_ID QW"),
+        ("images", "image-9.png", "image-8.png", "image-8.png comes twice"),
+        ("images", " 2 1 sub/image-8.png", " nan 1 sub/image-8.png", "finite"),
+    ],
+)
+def test_mistakes_in_text_are_named(
+    file: str, old: str, new: str, message: str, tmp_path: Path
+) -> None:
+    make(tmp_path, kind="txt")
+    path = tmp_path / f"sparse/0/{file}.txt"
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new, 1))
+    refused(message, load_recording, tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_models_are_read_without_pycolmap(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make(tmp_path, kind=kind)
+    (tmp_path / f"sparse/0/points3D.{kind}").unlink()
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    assert len(load_recording(tmp_path).train) == 4
 
 
 def test_names_of_images_stay_inside_the_folder(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""COLMAP models (Schönberger and Frahm, CVPR 2016), read by pycolmap (extra `colmap`).
+"""COLMAP models (Schönberger and Frahm, CVPR 2016), binary and text.
 
 COLMAP states camera_from_world, and its pixel (0.5, 0.5) is the centre of the top-left pixel, which
 is (0, 0) here. It ignores the EXIF orientation. Images without a pose count as untracked, including
@@ -6,51 +6,61 @@ files beside the images of the model. Of several models in one folder, the one w
 is read.
 """
 
+import struct
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from evercal.errors import InputError, optional_module
+from evercal.bounds import require_at_most
+from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.geometry.camera import COEFFICIENTS
-from evercal.processes import status_of
 from evercal.recordings.cameras.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.formats.nerfstudio import frame_note
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import as_stored, files_in
 from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import (
-    library_errors,
     named_errors,
     natural_key,
     path_inside,
 )
+from evercal.typing import Array
 
 _MODEL_FOLDERS = (".", "sparse", "colmap/sparse", "distorted/sparse")
 """Usual places of models; distorted/sparse is before undistortion."""
-_SUPPORTED = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "FULL_OPENCV",
-    "SIMPLE_FISHEYE",
-    "FISHEYE",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "OPENCV_FISHEYE",
-    "FOV",
-    "EUCM",
-)
-"""Camera models of which each parameter is OpenCV's, or that are `RADIAL_MODELS`."""
-_READ = "import pycolmap, sys; print(flush=True); pycolmap.Reconstruction(sys.argv[1])"
-"""Program that ends once a model is read."""
-_LEAST_S = 1.0
-"""Time for reading an empty binary model, seconds."""
-_SLOWEST_BYTES_PER_S = 5e6
-"""Bytes of a binary model that are read in a second, at least."""
+_PARAMETERS = {
+    "SIMPLE_PINHOLE": "fx cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "fx cx cy k1",
+    "RADIAL": "fx cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "FOV": "fx fy cx cy omega",
+    "SIMPLE_RADIAL_FISHEYE": "fx cx cy k1",
+    "RADIAL_FISHEYE": "fx cx cy k1 k2",
+    "THIN_PRISM_FISHEYE": "",
+    "RAD_TAN_THIN_PRISM_FISHEYE": "",
+    "SIMPLE_DIVISION": "",
+    "DIVISION": "",
+    "SIMPLE_FISHEYE": "fx cx cy",
+    "FISHEYE": "fx fy cx cy",
+    "EUCM": "fx fy cx cy alpha beta",
+    "EQUIRECTANGULAR": "",
+}
+"""Parameters of the camera models by name, in the order of their numbers in binary files.
+
+Those that are not empty are OpenCV's, or those of `RADIAL_MODELS`. The others are not supported.
+"""
+_LAYOUTS = {
+    "cameras": "CAMERA_ID MODEL WIDTH HEIGHT PARAMS",
+    "images": "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME",
+}
+"""Lines of text files; one of observations follows that of an image."""
+_INCOMPLETE = "ends early or holds more than it lists; copy it again"
 
 
 def detect(root: Path) -> bool:
@@ -65,30 +75,26 @@ def load(root: Path, options: ReadOptions) -> Recording:
         raise InputError(
             f"{root}: no COLMAP model; expected cameras and images (.bin or .txt)"
         )
-    folder = max(models, key=lambda folder: models[folder].num_reg_images())
-    model = models[folder]
+    folder = max(models, key=lambda folder: len(models[folder]))
+    posed = models[folder]
+    names = sorted(posed, key=natural_key)
     notes = [frame_note("COLMAP", options.metres)]
     if len(models) > 1:
-        sizes = [
-            f"{path.name}: {part.num_reg_images()}" for path, part in models.items()
-        ]
+        sizes = [f"{path.name}: {len(part)}" for path, part in models.items()]
         notes.append(
             f"took model {folder.name}, the one with the most images ({', '.join(sizes)})"
         )
-    cameras = {key: _camera(folder, part) for key, part in model.cameras.items()}
-    posed = [image for image in model.images.values() if image.has_pose]
-    posed.sort(key=lambda image: natural_key(image.name))
     if not posed:
         raise InputError(
             f"{folder}: no image has a pose; reconstruct with more overlap"
         )
-    images = _image_folder(root, folder, [image.name for image in posed])
+    images = _image_folder(root, folder, names)
     frames = []
-    for image in posed:
-        file = as_stored(images / image.name)
-        pose = _pose(folder, image)
-        frames.append(Frame(image.name, file, cameras[image.camera_id], pose))
-    total = len(model.images)
+    for name in names:
+        camera, base_from_camera = posed[name]
+        file = as_stored(images / name)
+        frames.append(Frame(name, file, camera, base_from_camera))
+    total = len(posed)
     if images != root:
         total = max(total, len(files_in(images, glob="**/*")))
     name = root.resolve().name
@@ -108,100 +114,127 @@ def _models(root: Path) -> list[Path]:
                 # The root may be a folder of models, which COLMAP numbers.
                 if name != "." or folder.name.isdigit():
                     folders.append(folder)
-        models = [folder for folder in folders if _is_model(folder)]
+        models = [folder for folder in folders if _ending(folder)]
         if models:
             return models
     return []
 
 
-def _is_model(folder: Path) -> bool:
+def _ending(folder: Path) -> str:
+    """Ending of the files of a model; as in COLMAP, binary files come before text."""
     for end in (".bin", ".txt"):
-        if all((folder / (name + end)).is_file() for name in ("cameras", "images")):
-            return True
-    return False
+        if all((folder / (name + end)).is_file() for name in _LAYOUTS):
+            return end
+    return ""
 
 
-def _model(folder: Path) -> Any:
-    need = f"{folder}: reading a COLMAP model needs pycolmap"
-    pycolmap = optional_module("pycolmap", need, "colmap")
-    _require_ends(folder)
-    with library_errors(f"{folder}: pycolmap cannot read the model"):
-        model = pycolmap.Reconstruction(str(folder))
-        names = _names(folder)
-        for key, image in model.images.items():
-            name = names.get(key, image.name)  # decodes UTF-8
-            image.name = path_inside(name, "the name of an image")
-        return model
+def _model(folder: Path) -> dict[str, tuple[Camera, SE3]]:
+    """Camera and pose of each image."""
+    end = _ending(folder)
+    read = _binary if end == ".bin" else _text
+    cameras = {}
+    file = folder / f"cameras{end}"
+    with named_errors(file, "COLMAP model"):
+        for key, model, width, height, *numbers in read(file):
+            size = (int(width), int(height))
+            cameras[int(key)] = _camera(model, size, np.array(numbers, np.float64))
+    images = {}
+    file = folder / f"images{end}"
+    with named_errors(file, "COLMAP model"):
+        for _, *pose, key, name in read(file):
+            name = path_inside(name, "the name of an image")
+            if name in images or int(key) not in cameras:
+                raise ValueError(f"{name} comes twice, or camera {key} has no entry")
+            numbers = np.array(pose, np.float64)
+            camera_from_world = SE3(numbers[:4], numbers[4:])
+            images[name] = (cameras[int(key)], camera_from_world.inverse())
+    return images
 
 
-def _names(folder: Path) -> dict[int, str]:
-    """Names of the images of a text model, which pycolmap cuts at the first blank."""
-    if (folder / "images.bin").is_file():
-        return {}
-    text = (folder / "images.txt").read_text("utf-8")
-    lines = [line for line in text.split("\n") if line[:1] != "#"]
-    names = {}
-    for line in lines[::2]:
-        words = line.split(maxsplit=9)
-        if words:
-            names[int(words[0])] = words[9]
+def _text(path: Path) -> Iterator[list[str]]:
+    layout = _LAYOUTS[path.stem].split()
+    with path.open(encoding="utf-8-sig") as stream:
+        for line in stream:
+            words = line.split()
+            if words and line[0] != "#":
+                if len(words) < len(layout):
+                    raise ValueError(f"{line.strip()[:80]!r} is not {' '.join(layout)}")
+                if path.stem == "images":
+                    # The name may have blanks; a line of observations follows.
+                    words = line.strip().split(maxsplit=9)
+                    next(stream, "")
+                yield words
+
+
+def _binary(path: Path) -> Iterator[Sequence[Any]]:
+    read = _stored_image if path.stem == "images" else _stored_camera
+    with path.open("rb") as stream:
+        (count,) = _numbers(stream, "Q")
+        for _ in range(count):
+            yield read(stream)
+        if stream.tell() != path.stat().st_size:
+            raise ValueError(_INCOMPLETE)
+
+
+def _numbers(stream: BinaryIO, kinds: str) -> tuple[Any, ...]:
+    """The next numbers, of kinds as in the module `struct`."""
+    layout = struct.Struct(f"<{kinds}")
+    data = stream.read(layout.size)
+    if len(data) < layout.size:
+        raise ValueError(_INCOMPLETE)
+    return layout.unpack(data)
+
+
+def _stored_camera(stream: BinaryIO) -> Sequence[Any]:
+    key, kind, *size = _numbers(stream, "IiQQ")
+    model = dict(enumerate(_PARAMETERS)).get(kind, f"{kind}")
+    count = len(_parameters(model))
+    return key, model, *size, *_numbers(stream, f"{count}d")
+
+
+def _stored_image(stream: BinaryIO) -> Sequence[Any]:
+    numbers = _numbers(stream, "I7dI")
+    name = b""
+    while byte := stream.read(1).strip(b"\0"):
+        name += byte
+        require_at_most(len(name), "cell_characters", "characters of a name")
+    (points,) = _numbers(stream, "Q")
+    require_at_most(points, "numbers", "observations of an image")
+    stream.seek(24 * points, 1)
+    return *numbers, name.decode(errors="replace")
+
+
+def _parameters(model: str) -> list[str]:
+    """Names of the parameters of a camera model."""
+    names = _PARAMETERS.get(model, "").split()
+    if not names:
+        supported = [name for name, parameters in _PARAMETERS.items() if parameters]
+        raise ValueError(
+            f"camera model {model} is not supported, only {', '.join(supported)};"
+            f" undistort the images with 'colmap image_undistorter' and read its result"
+        )
     return names
 
 
-def _require_ends(folder: Path) -> None:
-    """Refuse binary files that pycolmap would read without end.
-
-    At the end of an incomplete file it goes on with what is left in memory. So a process of its
-    own reads the model first.
-    """
-    sizes = {file: file.stat().st_size for file in sorted(folder.glob("*.bin"))}
-    for file, size in sizes.items():
-        with file.open("rb") as stream:
-            count = int.from_bytes(stream.read(8), "little")
-        if size < 8 or count > (size - 8) / 8:  # no entry is shorter
-            raise InputError(
-                f"{file}: {size} bytes, too few for what it lists; copy it again"
-            )
-    seconds = _LEAST_S + sum(sizes.values()) / _SLOWEST_BYTES_PER_S
-    if sizes and status_of(_READ, str(folder), seconds=seconds) is None:
-        raise InputError(
-            f"{folder}: pycolmap does not finish reading it; a file is incomplete, copy it again"
-        )
-
-
-def _camera(folder: Path, camera: Any) -> Camera:
-    name = camera.model.name
-    if name not in _SUPPORTED:
-        raise InputError(
-            f"{folder}: camera model {name} is not supported, only {', '.join(_SUPPORTED)};"
-            f" undistort the images with 'colmap image_undistorter' and read its result"
-        )
-    names = camera.params_info.split(", ")
-    values = dict(zip(names, map(float, camera.params), strict=True))
-    values.setdefault("k1", values.get("k", 0.0))  # the only coefficient is called k
-    one_focal = values.get("f", 0.0)
-    focal = (values.get("fx", one_focal), values.get("fy", one_focal))
+def _camera(model: str, size: Sequence[int], numbers: Array) -> Camera:
+    names = _parameters(model)
+    if len(numbers) != len(names):
+        raise ValueError(f"{model} has the parameters {names}, got {len(numbers)}")
+    values = dict(zip(names, numbers.tolist(), strict=True))
+    fx = values["fx"]
+    focal = (fx, values.get("fy", fx))
     # COLMAP counts from the image's corner.
     centre = (values["cx"] - 0.5, values["cy"] - 0.5)
-    size = (int(camera.width), int(camera.height))
-    kind = name.lower()
-    with named_errors(folder, "COLMAP model"):
-        if kind in RADIAL_MODELS:
-            parameters = [values[key] for key in RADIAL_MODELS[kind].parameters]
-            return nearest_fisheye(kind, parameters, size, focal, centre)
-        model = "fisheye" if kind.endswith("fisheye") else "pinhole"
-        count = 8 if "k6" in values else 4
-        names = COEFFICIENTS[model][:count]
-        distortion = tuple(values.get(name, 0.0) for name in names)
-        return Camera(*size, *focal, *centre, distortion, model)
-
-
-def _pose(folder: Path, image: Any) -> SE3:
-    camera_from_world: Any = image.cam_from_world
-    if callable(camera_from_world):  # a method since pycolmap 3.12
-        camera_from_world = camera_from_world()
-    with named_errors(folder / image.name, "pose"):
-        return SE3.from_matrix(np.asarray(camera_from_world.matrix())).inverse()
+    kind = model.lower()
+    if kind in RADIAL_MODELS:
+        parameters = [values[key] for key in RADIAL_MODELS[kind].parameters]
+        return nearest_fisheye(kind, parameters, size, focal, centre)
+    lens = "fisheye" if kind.endswith("fisheye") else "pinhole"
+    count = 8 if "k6" in values else 4
+    names = COEFFICIENTS[lens][:count]
+    distortion = tuple(values.get(name, 0.0) for name in names)
+    width, height = size
+    return Camera(width, height, *focal, *centre, distortion, lens)
 
 
 def _image_folder(root: Path, folder: Path, names: list[str]) -> Path:
