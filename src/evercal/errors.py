@@ -18,8 +18,9 @@ _FIELD = re.compile(r"`([a-z]\w*)`")
 """An argument in a message: `robot_poses`."""
 NO_WHEELS = {
     ("colmap", "Linux", "aarch64"): (
-        "make the model with COLMAP itself (apt-get install colmap), models are read without"
-        " pycolmap; or reconstruct on another computer"
+        "which has no wheel for Linux arm64: make the model with COLMAP itself"
+        " (apt-get install colmap), models are read without pycolmap; or reconstruct on another"
+        " computer"
     )
 }
 """The way on where an extra has no wheels, by extra, system and machine."""
@@ -97,10 +98,9 @@ def missing_extra(need: str, extra: str) -> InputError:
         need: What needs which package, such as "a client needs urllib3".
         extra: The extra of evercal that holds it.
     """
-    where = (platform.system(), platform.machine())
-    if (extra, *where) in NO_WHEELS:
-        way_on = NO_WHEELS[(extra, *where)]
-        return InputError(f"{need}, which has no wheel for {' '.join(where)}: {way_on}")
+    way_on = NO_WHEELS.get((extra, platform.system(), platform.machine()))
+    if way_on:
+        return InputError(f"{need}, {way_on}")
     command = f"python -m pip install -c constraints.txt '.[{extra}]'"
     return InputError(f"{need}; in the checkout of evercal, run: {command}")
 

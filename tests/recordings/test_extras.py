@@ -41,5 +41,5 @@ def test_where_a_package_has_no_wheels_the_error_names_another_way(
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     monkeypatch.setattr(platform, "system", lambda: "Linux")
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")
-    message = "no wheel for Linux aarch64: .*apt-get install colmap.*another computer"
+    message = "no wheel for Linux arm64: .*apt-get install colmap.*another computer"
     refused(message, reconstruct, tmp_path, tmp_path / "out")

@@ -92,15 +92,17 @@ def load(root: Path, options: ReadOptions) -> Recording:
     frames = []
     for name in names:
         camera, base_from_camera = posed[name]
-        file = as_stored(images / name)
-        frames.append(Frame(name, file, camera, base_from_camera))
-    total = len(posed)
+        frames.append(Frame(name, as_stored(images / name), camera, base_from_camera))
+    lost = 0
     if images != root:
-        total = max(total, len(files_in(images, glob="**/*")))
-    name = root.resolve().name
-    lost = total - len(frames)
+        lost = max(0, len(files_in(images, glob="**/*")) - len(frames))
     return Recording(
-        name, tuple(frames), (), lost, notes=tuple(notes), metric=options.metres
+        root.resolve().name,
+        tuple(frames),
+        (),
+        lost,
+        notes=tuple(notes),
+        metric=options.metres,
     )
 
 
@@ -152,13 +154,13 @@ def _model(folder: Path) -> dict[str, tuple[Camera, SE3]]:
 
 
 def _text(path: Path) -> Iterator[list[str]]:
-    layout = _LAYOUTS[path.stem].split()
+    layout = _LAYOUTS[path.stem]
     with path.open(encoding="utf-8-sig") as stream:
         for line in stream:
             words = line.split()
             if words and line[0] != "#":
-                if len(words) < len(layout):
-                    raise ValueError(f"{line.strip()[:80]!r} is not {' '.join(layout)}")
+                if len(words) < len(layout.split()):
+                    raise ValueError(f"{line.strip()[:80]!r} is not {layout}")
                 if path.stem == "images":
                     # The name may have blanks; a line of observations follows.
                     words = line.strip().split(maxsplit=9)
@@ -188,7 +190,7 @@ def _numbers(stream: BinaryIO, kinds: str) -> tuple[Any, ...]:
 def _stored_camera(stream: BinaryIO) -> Sequence[Any]:
     key, kind, *size = _numbers(stream, "IiQQ")
     model = dict(enumerate(_PARAMETERS)).get(kind, f"{kind}")
-    count = len(_parameters(model))
+    count = len(_PARAMETERS.get(model, "").split())
     return key, model, *size, *_numbers(stream, f"{count}d")
 
 
@@ -204,8 +206,7 @@ def _stored_image(stream: BinaryIO) -> Sequence[Any]:
     return *numbers, name.decode(errors="replace")
 
 
-def _parameters(model: str) -> list[str]:
-    """Names of the parameters of a camera model."""
+def _camera(model: str, size: tuple[int, int], numbers: Array) -> Camera:
     names = _PARAMETERS.get(model, "").split()
     if not names:
         supported = [name for name, parameters in _PARAMETERS.items() if parameters]
@@ -213,11 +214,6 @@ def _parameters(model: str) -> list[str]:
             f"camera model {model} is not supported, only {', '.join(supported)};"
             f" undistort the images with 'colmap image_undistorter' and read its result"
         )
-    return names
-
-
-def _camera(model: str, size: Sequence[int], numbers: Array) -> Camera:
-    names = _parameters(model)
     if len(numbers) != len(names):
         raise ValueError(f"{model} has the parameters {names}, got {len(numbers)}")
     values = dict(zip(names, numbers.tolist(), strict=True))
@@ -233,8 +229,7 @@ def _camera(model: str, size: Sequence[int], numbers: Array) -> Camera:
     count = 8 if "k6" in values else 4
     names = COEFFICIENTS[lens][:count]
     distortion = tuple(values.get(name, 0.0) for name in names)
-    width, height = size
-    return Camera(width, height, *focal, *centre, distortion, lens)
+    return Camera(*size, *focal, *centre, distortion, lens)
 
 
 def _image_folder(root: Path, folder: Path, names: list[str]) -> Path:
