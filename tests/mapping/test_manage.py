@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evercal.continual.store import NetworkStore
 from evercal.errors import InputError
 from evercal.mapping import manage
 from evercal.mapping.manage import (
@@ -351,6 +350,9 @@ def test_changes_that_a_full_disk_refuses_leave_nothing(
 def test_a_map_that_lost_its_manifest_keeps_its_scenes(
     root: Path, other: Path, everything: Callable[[Path], dict[str, bytes | None]]
 ) -> None:
+    pytest.importorskip("torch", reason="the extra 'networks' is not installed")
+    from evercal.continual.store import NetworkStore
+
     packed = other.parent / "packed.zip"
     pack_map(other, packed)
     (root / MANIFEST).unlink()
