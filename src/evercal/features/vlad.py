@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from evercal.geometry.normal_equations import gram
 from evercal.typing import Array, Float32Array
 
 CENTROIDS = 16
@@ -105,7 +106,7 @@ def similar_pairs(
 ) -> list[tuple[int, int]]:
     """Pairs of images, each with the most similar other ones, by features (cells, channels)."""
     descriptors = np.stack([vlad(rows) for rows in features])
-    similarity = descriptors @ descriptors.T
+    similarity = gram(descriptors)
     np.fill_diagonal(similarity, -np.inf)
     count = min(partners, len(features) - 1)
     order = np.argsort(-similarity, 1, kind="stable")

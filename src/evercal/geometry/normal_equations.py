@@ -1,6 +1,6 @@
 """Normal equations whose unknowns have units that differ by orders of magnitude.
 
-Every function scales the (p, p) matrix to a unit diagonal first.
+Every function but `gram` scales the (p, p) matrix to a unit diagonal first.
 """
 
 import numpy as np
@@ -9,6 +9,16 @@ from evercal.typing import Array
 
 _TINY = 1e-300
 """Added to the diagonal, so that an unknown without information has a finite unit."""
+
+
+def gram(rows: Array) -> Array:
+    """Inner products (..., n, n) of rows (..., n, k), which may be float32.
+
+    OpenBLAS 0.3.31 multiplies float32 matrices wrongly by their own transpose on processors with
+    SME (issue 5873 of OpenBLAS). A copy of the transpose is another matrix.
+    """
+    transposed = np.swapaxes(rows, -1, -2)
+    return rows @ transposed.copy()
 
 
 def normal_inverse(normal: Array, ridge: float) -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.geometry import SE3
+from evercal.geometry.normal_equations import gram
 from evercal.typing import Array, IntArray
 
 MOST_LANDMARKS = 400
@@ -44,7 +45,7 @@ def pattern_steps(points_m: Array, templates: Array, position_m: Array) -> Array
     patches = templates[sampled]
     distances = np.linalg.norm(points - position_m, axis=1)
     distance = float(np.median(distances))
-    correlation = patches @ patches.T
+    correlation = gram(patches)
     first, second = np.nonzero(correlation > ALIKE * patches.shape[1])
     moves = points[second] - points[first]
     lengths = np.linalg.norm(moves, axis=1)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from evercal.geometry import resize_pixels
+from evercal.geometry.normal_equations import gram
 from evercal.typing import Array, Image, IntArray
 
 RADIUS = 5
@@ -100,7 +101,7 @@ def cut_patches(image: Array, pixels: Array) -> Patches:
     deviation = np.sqrt((patch * patch).mean(1, keepdims=True)) + _FLAT
     gradient = np.stack([slope_u, slope_v], -1).reshape(n, SIDE * SIDE, 2)
     gradient /= deviation[..., None]
-    hessian = gradient.transpose(0, 2, 1) @ gradient
+    hessian = gram(gradient.transpose(0, 2, 1))
     # Beside a flat patch the slopes are so large that the damping needs double precision.
     inverse = np.linalg.inv(hessian + _DAMPING * np.eye(2)).astype(np.float32)
     templates = np.empty((n, 3, SIDE * SIDE), np.float32)
