@@ -128,15 +128,15 @@ def test_exit_code_is_1_without_any_pose(run, hall_store, images):
 def test_overlays_have_the_size_of_their_images(
     run, hall_store, images, hall, tmp_path
 ):
-    twin = tmp_path / "other" / "1-hall.png"
+    twin = tmp_path / "other" / "1-Hall.png"
     out = tmp_path / "overlays"
     twin.parent.mkdir()
     write_image(twin, np.repeat(np.repeat(hall.test[8].read_image(), 2, 0), 2, 1))
     assert run("localize", hall_store, twin, images, "--overlay", out).code == 0
     drawn = {path.name: read_image(path) for path in out.iterdir()}
     # Images without a scene get no overlay; images of one name are numbered.
-    assert drawn.keys() == {"1-hall-1-overlay.png", "1-hall-2-overlay.png"}
-    assert drawn["1-hall-1-overlay.png"].shape == (480, 640, 3)
+    assert drawn.keys() == {"1-Hall-1-overlay.png", "1-hall-2-overlay.png"}
+    assert drawn["1-Hall-1-overlay.png"].shape == (480, 640, 3)
     assert (drawn["1-hall-2-overlay.png"] != hall.test[7].read_image()).any()
 
 

@@ -41,7 +41,7 @@ def moved(recording: PreparedFrames, changes: dict[int, SE3]) -> PreparedFrames:
 
 
 def detected(recording: PreparedFrames) -> list[int]:
-    pairs = matched_pairs(recording, recording.encoder.vlad())
+    pairs = matched_pairs(recording)
     check = check_poses(recording, pairs)
     assert len(check.untracked) == 0
     return check.wrong.tolist()
@@ -73,8 +73,7 @@ def test_shifted_and_rotated_frames_are_detected(recording: PreparedFrames) -> N
 def test_depth_scale_is_that_of_the_recording(
     scale: float, recording: PreparedFrames
 ) -> None:
-    vlad = recording.encoder.vlad()
-    pairs = matched_pairs(recording, vlad)
+    pairs = matched_pairs(recording)
     scaled = moved(recording, {})
     assert depth_scale(recording, pairs) == 1  # as a room is
     poses = recording.poses
@@ -147,7 +146,7 @@ def test_sift_clears_frames_that_the_encoder_suspects(
     recording: PreparedFrames, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def suspicious(frames: PreparedFrames) -> list[MatchedPair]:
-        pairs = matched_pairs(frames, frames.encoder.vlad())
+        pairs = matched_pairs(frames)
         shift = np.array([60.0, 0.0])  # the encoder mistakes one square for another
         return [
             replace(p, pixels=p.pixels + shift) if 6 in (p.first, p.second) else p

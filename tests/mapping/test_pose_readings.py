@@ -24,7 +24,7 @@ Change = Callable[[SE3], SE3]
 def matched(hall: Recording) -> Matched:
     """The training frames of the hall, and their pairs."""
     recording = PreparedFrames(hall.train, load_encoder(), WorkingSize())
-    return recording, matched_pairs(recording, recording.encoder.vlad())
+    return recording, matched_pairs(recording)
 
 
 def check(matched: Matched, change: Change) -> None:

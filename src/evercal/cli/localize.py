@@ -132,10 +132,13 @@ class Localize(args.Verb):
 
 
 def _overlay_name(files: list[Path], number: int) -> str:
-    """A file name; images of one name from two folders get different ones."""
-    stems = [path.stem for path in files]
-    stem = stems[number]
-    if stems.count(stem) > 1:
+    """A file name; images of one name from two folders get different ones.
+
+    Capital letters do not make another name on Windows and macOS.
+    """
+    stems = [path.stem.lower() for path in files]
+    stem = files[number].stem
+    if stems.count(stem.lower()) > 1:
         return f"{stem}-{number + 1}-overlay.png"
     return f"{stem}-overlay.png"
 

@@ -187,11 +187,10 @@ def _prepare(
     wanted = spread_frames(frames, options.memory.capacity(frames, short_side))
     support = np.union1d(spread_frames(frames, options.support_frames), wanted)
     prepared = PreparedFrames([frames[i] for i in support], encoder, options.size)
-    features = []
     for i in range(len(prepared)):
-        features.append(prepared.features(i))
+        prepared.features(i)
         on_progress("encoding", i + 1, len(prepared))
-    pairs = matched_pairs(prepared, encoder.vlad(features))
+    pairs = matched_pairs(prepared)
     unit = None
     scale = depth_scale(prepared, pairs, options.metric)
     if options.metric:

@@ -17,7 +17,7 @@ from scipy.spatial.distance import cdist
 
 from evercal.features.sift import SiftFeatures, epipolar_rays, sift_features
 from evercal.features.views import cell_centres, ideal_cell_pixels
-from evercal.features.vlad import Vlad, similar_pairs
+from evercal.features.vlad import similar_pairs
 from evercal.geometry import Camera
 from evercal.mapping.plane_sweep import FAR_M, NEAR_M, USUAL_M
 from evercal.mapping.prepared_frames import PreparedFrames
@@ -78,10 +78,11 @@ class PoseCheck:
         return np.union1d(self.wrong, self.untracked)
 
 
-def matched_pairs(recording: PreparedFrames, vlad: Vlad) -> list[MatchedPair]:
-    """Match every frame with the most similar ones."""
+def matched_pairs(recording: PreparedFrames) -> list[MatchedPair]:
+    """Match every frame with the most similar ones; missing centroids are fitted to them."""
     features = [recording.features(i) for i in range(len(recording))]
     matched = []
+    vlad = recording.encoder.vlad(features)
     for i, j in similar_pairs(features, vlad, PARTNERS):
         pair = _matched(recording, i, j)
         if len(pair.ray) >= MIN_MATCHES:

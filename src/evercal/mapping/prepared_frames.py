@@ -15,12 +15,13 @@ from evercal.geometry import SE3, Camera
 from evercal.mapping.covisibility import select_source_views
 from evercal.mapping.patches import image_pyramid
 from evercal.mapping.plane_sweep import USUAL_M, PosedCells, inverse_depths
+from evercal.processes import cores
 from evercal.recordings.frame import Frame, stated_poses
 from evercal.typing import Array, Float32Array, Image, IntArray
 
 PYRAMID_LEVELS = 3
-_PYRAMIDS = 128
-"""Image pyramids in memory, at most."""
+_PYRAMIDS = 16
+"""Image pyramids in memory for each thread, at most; a keyframe is aligned in 12 frames."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,7 @@ class PreparedFrames:
 
     def _cache_pyramids(self) -> None:
         grey = self.grey
-        self._pyramid = lru_cache(_PYRAMIDS)(
+        self._pyramid = lru_cache(_PYRAMIDS * cores())(
             lambda i: image_pyramid(grey[i], PYRAMID_LEVELS)
         )
 

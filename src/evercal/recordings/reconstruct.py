@@ -116,7 +116,7 @@ def _chosen(source: str, images: Path, motion: float, most: int) -> list[str]:
             name = f"{Path(frame.name).stem}.jpg"
         else:
             name = f"{int(frame.name):06d}.jpg"
-        if name in names:
+        if (images / name).exists():  # where a.jpg and A.jpg are one file, too
             raise InputError(
                 f"{source}: has two images called {Path(name).stem}; rename one"
             )

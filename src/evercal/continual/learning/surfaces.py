@@ -42,8 +42,7 @@ def frame_depths(
     """
     prepared = PreparedFrames(frames, encoder, WorkingSize(short_side, short_side))
     numbers = range(len(prepared))
-    features = list(map(prepared.features, numbers))
-    pairs = matched_pairs(prepared, encoder.vlad(features))
+    pairs = matched_pairs(prepared)
     prepared.depth_scale = depth_scale(prepared, pairs)
     swept = []
     sources = []
