@@ -182,10 +182,19 @@ class _OnnxNetwork:
             level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
             try:
                 for source, engine in (
-                    (str(file), cv2.dnn.ENGINE_CLASSIC),
-                    (str(file), cv2.dnn.ENGINE_AUTO),
+                    (
+                        str(file),
+                        cv2.dnn.ENGINE_CLASSIC,
+                    ),
+                    (
+                        str(file),
+                        cv2.dnn.ENGINE_AUTO,
+                    ),
                     # On Windows OpenCV opens no file whose path is not ASCII.
-                    (np.frombuffer(self.data, np.uint8), cv2.dnn.ENGINE_AUTO),
+                    (
+                        np.frombuffer(self.data, np.uint8),
+                        cv2.dnn.ENGINE_AUTO,
+                    ),
                 ):
                     try:
                         return cv2.dnn.readNetFromONNX(source, engine=engine)
