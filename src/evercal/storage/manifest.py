@@ -11,7 +11,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PureWindowsPath
 from typing import Any, Self
 
 from evercal.bounds import require_at_most
@@ -179,5 +179,6 @@ def _body_sha256(body: dict) -> str:
 
 
 def _stays_inside(relative: str) -> bool:
-    path = PurePosixPath(relative)
-    return bool(relative) and not path.is_absolute() and ".." not in path.parts
+    # As on Windows, where backslashes and drives lead elsewhere, too.
+    path = PureWindowsPath(relative)
+    return bool(relative) and not path.anchor and ".." not in path.parts
