@@ -18,7 +18,8 @@ from evercal.mapping.built_map import BuiltMap, HandEyeCorrection
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.memory_budget import MemoryBudget
-from evercal.mapping.prepared_frames import WorkingSize
+from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
+from evercal.processes import cores
 from evercal.recordings.frame import Frame, Recording
 from evercal.simulation.box_room import BoxRoom
 
@@ -349,3 +350,12 @@ def test_depths_are_refined_again_only_where_poses_moved(
     options = replace(SMALL, size=WorkingSize(cells=64, patches=64))
     build_map("room", rooms[0].train[:16], encoder, options)
     assert len(solved) == rounds
+
+
+def test_memory_of_pyramids_does_not_grow_with_the_recording(hall: Recording) -> None:
+    prepared = PreparedFrames(hall.train, load_encoder(), WorkingSize())
+    first = prepared.pyramid(0)[2]
+    for i in range(len(prepared)):
+        prepared.pyramid(i)
+    assert prepared._pyramid.cache_info().currsize == 16 * cores() < len(prepared)
+    assert (prepared.pyramid(0)[2] == first).all()
