@@ -163,10 +163,13 @@ def working_image(
     small = camera.short_side_resized(short_side)
     size = small.width, small.height
     if grey.shape != (small.height, small.width):
-        kind = cv2.INTER_LINEAR
         if small.height < grey.shape[0]:
-            kind = cv2.INTER_AREA
-        grey = cv2.resize(grey, size, interpolation=kind)
+            grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        else:
+            # OpenCV 5.0.0 on arm64 errs by 3 grey levels with one channel, with two it does not.
+            twice = cv2.merge([grey, grey])
+            large = cv2.resize(twice, size, interpolation=cv2.INTER_LINEAR)
+            grey = cv2.extractChannel(large, 0)
     return np.asarray(grey, np.uint8), small
 
 
