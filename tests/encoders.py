@@ -4,6 +4,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from evercal.features.encoder import Encoder, load_encoder
 from evercal.typing import Float32Array, Image
@@ -31,8 +32,8 @@ class BlockMean(Encoder):
 
 def tiny_onnx(seed: int = 0) -> bytes:
     """An ONNX file of a small network with random weights."""
-    import torch
-
+    torch = pytest.importorskip("torch", reason="the extra 'networks' is not installed")
+    pytest.importorskip("onnx", reason="onnx is not installed")
     from training.network import Layout, LocalEncoder, onnx_bytes
 
     with torch.random.fork_rng(devices=[]):
