@@ -39,7 +39,7 @@ def run(out: Path = Path("results/pnp.csv"), cases: int = 60) -> None:
     solvers: dict[str, Solver] = {
         "evercal": partial(_solved, _OPTIONS),
         "without refinement": _changed("_STEPS", 0),
-        "refined with inliers only": _changed("_NEAR", 1.0),
+        "refined by inliers": _changed("_NEAR", 1.0),
         "1000 iterations": partial(_solved, replace(_OPTIONS, max_iterations=1000)),
         "300 iterations": partial(_solved, replace(_OPTIONS, max_iterations=300)),
         "any order": partial(_solved, replace(_OPTIONS, progressive_sampling=False)),
@@ -88,8 +88,8 @@ def _measured(
         shift = np.inf if pose is None else pose.translation_m - truth.translation_m
         errors.append(float(np.linalg.norm(shift)))
     return {
-        "right, %": 100 * float(np.mean(np.array(errors) < _FOUND_M)),
-        "median, mm": 1000 * float(np.median(errors)),
+        "right_%": 100 * float(np.mean(np.array(errors) < _FOUND_M)),
+        "median_mm": 1000 * float(np.median(errors)),
         "ms": 1000 * seconds / len(drawn),
     }
 

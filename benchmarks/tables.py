@@ -277,6 +277,7 @@ TABLES: dict[str, Callable[[], Table]] = {
         "answer,camera,stated,answers,located,median_mm,95_%_mm,inside_95_%,wrong",
         "same-model",
     ),
+    "map: PnP": _rows("matches,outliers,solver,right_%,median_mm,ms", "pnp"),
     "results: speed": _rows("what,beside,now,ratio", "speed"),
     "speed: AVX2": _rows("what,beside,now,ratio", "speed-avx2"),
     "boards: solvers": lambda: _rows(

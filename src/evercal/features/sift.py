@@ -72,26 +72,38 @@ def epipolar_rays(
     rows, matched = _distinct_matches(a.descriptors, b.descriptors)
     pixels_a = a.pixels[rows]
     pixels_b = b.pixels[matched]
-    rays = np.stack([first.unproject(pixels_a), second.unproject(pixels_b)])
+    rays_a = first.unproject(pixels_a)
+    rays_b = second.unproject(pixels_b)
+    rays = np.stack([rays_a, rays_b])
     moved_px = np.linalg.norm(pixels_a - pixels_b, axis=1)
-    valid = np.isfinite(rays).all((0, 2)) & (moved_px >= least_px)
-    rays = rays[:, valid]
+    valid = np.isfinite(rays).all((0, 2))
+    valid &= moved_px >= least_px
     if valid.sum() < MIN_INLIERS:
         return None
+    rays = rays[:, valid]
+    # Rays of a pinhole with focal length 1.
+    plane_a, plane_b = rays[:, :, :2]
+    pinhole = np.eye(3)
     parameters = cv2.UsacParams()
     parameters.threshold = EPIPOLAR_PX / math.sqrt(first.fx * second.fx)
     parameters.maxIterations = ITERATIONS
     parameters.score = cv2.SCORE_METHOD_MSAC
     parameters.loMethod = cv2.LOCAL_OPTIM_INNER_LO
-    # Rays of a pinhole with focal length 1.
-    plane_a, plane_b = rays[:, :, :2]
-    unit = np.eye(3)
     _, mask = cv2.findEssentialMat(
-        plane_a, plane_b, unit, unit, None, None, params=parameters
+        plane_a,
+        plane_b,
+        pinhole,
+        pinhole,
+        None,
+        None,
+        params=parameters,
     )
-    if mask is None or np.count_nonzero(mask) < MIN_INLIERS:
+    if mask is None:
         return None
-    return rays[:, mask.ravel() > 0]
+    inliers = np.flatnonzero(mask)
+    if len(inliers) < MIN_INLIERS:
+        return None
+    return rays[:, inliers]
 
 
 def _distinct_matches(a: Float32Array, b: Float32Array) -> tuple[IntArray, IntArray]:

@@ -12,6 +12,7 @@ from evercal.localization.intrinsics import IntrinsicsPrior
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.pnp import PnpOptions, solve_pnp
 from evercal.localization.pose_refinement import (
+    Minimum,
     Observed,
     Pose,
     minimise,
@@ -185,8 +186,13 @@ def _shift_by_intrinsics_px(camera: Camera, change: Array) -> float:
     return float(np.sort(shifts)[-7])
 
 
+def _disagree(minimum: Minimum) -> bool:
+    """Whether at most half of the matches agree with a pose."""
+    return bool(np.median(minimum.residual_px) > _LOOSE_PNP.threshold_px)
+
+
 def _consistent(observed: Observed, camera: Camera) -> Pose | None:
-    """The pose that most of the matches agree with; None if few do."""
+    """The pose that most matches agree with, by RANSAC; None if few do."""
     rays = camera.unproject(observed.pixels)
     ideal = camera.pinhole.project(rays)
     valid = np.isfinite(ideal).all(1)
@@ -245,13 +251,12 @@ class _Search:
             observed = self.run(step, camera, pose, observed)
             if observed is None:
                 return None
-            rough = pose
-            if step.level:
-                # Many matches of the first round are wrong; RANSAC selects a consistent set.
+            minimum = minimise(observed, camera, pose, step.steps)
+            if step.level and _disagree(minimum):
                 rough = _consistent(observed, camera)
                 if rough is None:
                     return None
-            minimum = minimise(observed, camera, rough, step.steps)
+                minimum = minimise(observed, camera, rough, step.steps)
             pose = minimum.rotation, minimum.position
         observed = self.run(last, camera, pose, observed)
         if observed is None:

@@ -78,9 +78,8 @@ def solve_pnp(
     parameters.score = cv2.SCORE_METHOD_RANSAC
     if options.progressive_sampling:
         parameters.sampler = cv2.SAMPLING_PROSAC
-    # OpenCV's own refinement takes three times as long as the steps below.
+    # OpenCV's own refinement takes several times as long as that of `_refined`.
     parameters.loMethod = cv2.LOCAL_OPTIM_NULL
-    parameters.final_polisher = cv2.NONE_POLISHER
     focal = np.diag([camera.fx, camera.fy, 1.0])
     focal[:2, 2] = camera.cx, camera.cy
     solved, _, turn, shift, _ = cv2.solvePnPRansac(
