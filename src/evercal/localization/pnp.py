@@ -82,10 +82,10 @@ def solve_pnp(
     parameters.loMethod = cv2.LOCAL_OPTIM_NULL
     focal = np.diag([camera.fx, camera.fy, 1.0])
     focal[:2, 2] = camera.cx, camera.cy
-    solved, _, turn, shift, _ = cv2.solvePnPRansac(
+    solved, _, turn, shift, inliers = cv2.solvePnPRansac(
         points_m, pixels, focal, None, params=parameters
     )
-    if not solved:
+    if not solved or len(inliers) < MIN_INLIERS:
         return None
     rotation = np.asarray(cv2.Rodrigues(turn)[0], np.float64).T
     start = rotation, -rotation @ np.asarray(shift, np.float64).ravel()
