@@ -162,6 +162,7 @@ def test_broken_files_are_refused(tmp_path: Path) -> None:
         ("cameras", "1 PINHOLE 64", "3 PINHOLE 64", "camera 1 has no entry"),
         ("images", "sub/image-9.png", "", "images.txt: '2 .*' is not IMAGE_ID QW"),
         ("images", "image-9.png", "image-8.png", "image-8.png comes twice"),
+        ("images", "8.png\n\n", "8.png\n", "no line of observations .* an empty line"),
         ("images", " 2 1 sub/image-8.png", " nan 1 sub/image-8.png", "finite"),
     ],
 )

@@ -164,7 +164,12 @@ def _text(path: Path) -> Iterator[list[str]]:
                 if path.stem == "images":
                     # The name may have blanks; a line of observations follows.
                     words = line.strip().split(maxsplit=9)
-                    next(stream, "")
+                    observations = next(stream, "")
+                    if len(observations.split()) % 3:
+                        raise ValueError(
+                            f"no line of observations follows that of {words[-1]};"
+                            " an empty line is enough"
+                        )
                 yield words
 
 
