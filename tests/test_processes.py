@@ -213,10 +213,12 @@ def test_the_quota_of_a_container_bounds_the_threads(
     monkeypatch.setattr(processes, "_CGROUPS", tmp_path / "groups")
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
-    monkeypatch.delenv("OMP_NUM_THREADS")
+    for name in processes._COUNTS:
+        monkeypatch.delenv(name, raising=False)
     assert processes.cores() == count
     monkeypatch.setenv("PYTHON_CPU_COUNT", "1")
     assert processes.cores() == 1
     monkeypatch.setenv("PYTHON_CPU_COUNT", "default")
     monkeypatch.setenv("OMP_NUM_THREADS", "0")
+    monkeypatch.setenv("OPENCV_FOR_THREADS_NUM", "9" * 5000)
     assert processes.cores() == count

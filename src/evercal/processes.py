@@ -21,8 +21,10 @@ from multiprocessing.process import parent_process
 from pathlib import Path
 from typing import Any
 
-_COUNTS = ("OMP_NUM_THREADS", "PYTHON_CPU_COUNT")
+_COUNTS = ("OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "PYTHON_CPU_COUNT")
 """Variables that bound the number of threads."""
+_DIGITS = 10
+"""Digits of a number that no longer bounds anything."""
 _CGROUPS = Path("/sys/fs/cgroup")
 """Files of the groups of processes; in a container, those of its own."""
 _PROC = Path("/proc")
@@ -56,7 +58,7 @@ def cores() -> int:
         counts.append(len(os.sched_getaffinity(0)))
     for name in _COUNTS:
         count = os.environ.get(name, "")
-        if count.isdecimal():
+        if count.isdecimal() and len(count) < _DIGITS:
             counts.append(int(count))
     return min(filter(None, counts))
 

@@ -135,9 +135,9 @@ def test_overlays_have_the_size_of_their_images(
     assert run("localize", hall_store, twin, images, "--overlay", out).code == 0
     drawn = {path.name: read_image(path) for path in out.iterdir()}
     # Images without a scene get no overlay; images of one name are numbered.
-    assert drawn.keys() == {"1-Hall-1-overlay.png", "1-hall-2-overlay.png"}
-    assert drawn["1-Hall-1-overlay.png"].shape == (480, 640, 3)
-    assert (drawn["1-hall-2-overlay.png"] != hall.test[7].read_image()).any()
+    assert drawn.keys() == {"1-1-Hall-overlay.png", "2-1-hall-overlay.png"}
+    assert drawn["1-1-Hall-overlay.png"].shape == (480, 640, 3)
+    assert (drawn["2-1-hall-overlay.png"] != hall.test[7].read_image()).any()
 
 
 def test_camera_file_replaces_the_camera_of_the_scene(

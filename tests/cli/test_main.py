@@ -200,7 +200,15 @@ def test_bugs_are_not_reported_as_bad_input(monkeypatch):
         main(["info", "x"])
 
 
-def test_closed_pipe_is_no_error():
+def test_closed_stdout_is_no_error() -> None:
+    command = [sys.executable, "-m", "evercal", "--version"]
+    closing = "import os, sys; os.close(1); os.execv(sys.argv[1], sys.argv[1:])"
+    words = [sys.executable, "-c", closing, *command]
+    ended = subprocess.run(words, stderr=subprocess.PIPE, text=True)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_closed_pipe_has_the_status_of_other_programs_and_no_traceback():
     with subprocess.Popen(
         [sys.executable, "-m", "evercal", "--help"],
         stdout=subprocess.PIPE,
@@ -210,4 +218,4 @@ def test_closed_pipe_is_no_error():
         assert process.stderr is not None
         process.stdout.close()
         assert process.stderr.read() == b""
-        assert process.wait(timeout=60) == 0
+        assert process.wait(timeout=60) == 141

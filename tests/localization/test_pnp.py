@@ -89,6 +89,18 @@ def test_many_outliers_leave_the_pose_accurate() -> None:
     assert np.median(errors_m) < 0.005
 
 
+@pytest.mark.parametrize("focal", [1.0, 1e4, 1e6, 1e9])
+def test_any_focal_length_gives_a_pose_or_none(focal: float) -> None:
+    camera = Camera(320, 240, focal, focal, 159.5, 119.5)
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        pixels = rng.uniform([0, 0], [319, 239], (80, 2))
+        points = rng.normal(0, 2, (80, 3))
+        for cloud in (points, points[:1].repeat(80, 0), points + 1e7):
+            result = solve_pnp(pixels, cloud, camera, PnpOptions())
+            assert result is None or result.inlier_count >= 6
+
+
 @pytest.mark.parametrize("count", [0, 3, 5])
 def test_too_few_points_give_none(count: int) -> None:
     _, pixels, points = case(0, count)

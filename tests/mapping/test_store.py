@@ -203,6 +203,21 @@ def test_update_replaces_one_scene(
     assert len(list((root / "stages").iterdir())) == 3
 
 
+def test_a_scene_that_could_not_be_read_is_not_written(
+    scenes: list[SceneMap], tmp_path: Path, make: Make, tree: Tree
+) -> None:
+    store = make(tmp_path / "store", scenes[:1])
+    before = tree(tmp_path / "store")
+    keyframes = scenes[1].keyframes
+    far = keyframes.base_from_camera
+    far = SE3(far.rotation_wxyz, far.translation_m + 1e6)
+    scene = replace(scenes[1], keyframes=replace(keyframes, base_from_camera=far))
+    with pytest.raises(InputError, match="poses: numbers are below 1e"):
+        store.commit(scene, {})
+    assert tree(tmp_path / "store") == before
+    assert len(MapStore.open(tmp_path / "store").contents.scenes) == 1
+
+
 def test_undo_does_not_bring_back_an_earlier_base_frame(
     scenes: list[SceneMap], tmp_path: Path, make: Make
 ) -> None:

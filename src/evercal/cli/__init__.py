@@ -48,6 +48,8 @@ VERBS = {
 }
 """Verbs by purpose, in the order of the help. The class `Learn` of `learn` is in `learn.py`."""
 
+_BROKEN_PIPE = 141
+"""Status of a program whose reader has ended: 128 and the number of SIGPIPE."""
 _X86 = ("x86_64", "AMD64")
 _SAME_ARITHMETIC = {"OPENBLAS_CORETYPE": "Haswell", "MKL_CBWR": "COMPATIBLE"}
 """Matrix products by kernels that every x86 processor with AVX2 has, for `EVERCAL_PRECISION`."""
@@ -60,7 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: words after `evercal`. Default: those of the process.
 
     Returns:
-        The exit code: 0 done, 1 negative result, 2 misuse or bad input, 130 interrupted.
+        The exit code: 0 done, 1 negative result, 2 misuse or bad input, 130 interrupted,
+            141 the reader of the output ended first.
     """
     words = sys.argv[1:] if argv is None else list(argv)
     as_json = "--json" in words
@@ -70,6 +73,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if os.environ.get("EVERCAL_PRECISION") == "float32" and platform.machine() in _X86:
         for name, value in _SAME_ARITHMETIC.items():
             os.environ.setdefault(name, value)
+    if sys.stdout is None:  # closed before the start
+        sys.stdout = io.TextIOWrapper(io.BytesIO(), "utf-8")
     if isinstance(sys.stdout, io.TextIOWrapper):
         # Its encoding may lack letters of a name; stderr escapes them anyway.
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -83,8 +88,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         return _complain(str(error), as_json)
     except BrokenPipeError:
-        _discard_stdout()  # the reader closed the pipe
-        return 0
+        _discard_stdout()  # the reader closed the pipe, perhaps before the work was done
+        return _BROKEN_PIPE
     except OSError as error:  # a full disk, a folder that may not be written
         # What writes elsewhere names its file.
         where = error.filename or f"standard output or {tempfile.gettempdir()}"

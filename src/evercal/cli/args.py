@@ -87,7 +87,7 @@ class Verb:
         if self.limits:
             os.environ[VARIABLE] = self.limits
         for name in ("OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
-            os.environ.setdefault(name, str(cores()))
+            os.environ[name] = str(cores())
         os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(bounds().pixels))
 
     @property

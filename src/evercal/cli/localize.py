@@ -132,14 +132,13 @@ class Localize(args.Verb):
 
 
 def _overlay_name(files: list[Path], number: int) -> str:
-    """A file name; images of one name from two folders get different ones.
+    """A file name; all are numbered if images from two folders have one name.
 
     Capital letters do not make another name on Windows and macOS.
     """
-    stems = [path.stem.lower() for path in files]
     stem = files[number].stem
-    if stems.count(stem.lower()) > 1:
-        return f"{stem}-{number + 1}-overlay.png"
+    if len({path.stem.lower() for path in files}) < len(files):
+        stem = f"{number + 1}-{stem}"
     return f"{stem}-overlay.png"
 
 

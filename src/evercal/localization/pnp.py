@@ -85,7 +85,7 @@ def solve_pnp(
     solved, _, turn, shift, inliers = cv2.solvePnPRansac(
         points_m, pixels, focal, None, params=parameters
     )
-    if not solved or len(inliers) < MIN_INLIERS:
+    if not solved or inliers is None or len(inliers) < MIN_INLIERS:
         return None
     rotation = np.asarray(cv2.Rodrigues(turn)[0], np.float64).T
     start = rotation, -rotation @ np.asarray(shift, np.float64).ravel()

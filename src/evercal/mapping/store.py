@@ -243,6 +243,8 @@ def require_map(root: Path, manifest: Manifest) -> dict[str, Any]:
 
 def write_scene(folder: Path, scene: SceneMap) -> None:
     """Write everything of a scene but its keyframes into its folder."""
+    with named_errors(f"scene {scene.name!r}", "map"):
+        require_consistent(scene)
     content = {
         "name": scene.name,
         "camera": scene.camera.to_dict(),

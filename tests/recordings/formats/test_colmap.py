@@ -163,6 +163,12 @@ def test_broken_files_are_refused(tmp_path: Path) -> None:
         ("images", "sub/image-9.png", "", "images.txt: '2 .*' is not IMAGE_ID QW"),
         ("images", "image-9.png", "image-8.png", "image-8.png comes twice"),
         ("images", "8.png\n\n", "8.png\n", "no line of observations .* an empty line"),
+        (
+            "images",
+            "sub/image-9.png",
+            "shot 1 a.png\n4 1 0 0 0 0 0 0 1 shot 1 a.png",
+            "no line of observations",
+        ),
         ("images", " 2 1 sub/image-8.png", " nan 1 sub/image-8.png", "finite"),
     ],
 )

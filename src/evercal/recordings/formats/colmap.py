@@ -164,8 +164,9 @@ def _text(path: Path) -> Iterator[list[str]]:
                 if path.stem == "images":
                     # The name may have blanks; a line of observations follows.
                     words = line.strip().split(maxsplit=9)
-                    observations = next(stream, "")
-                    if len(observations.split()) % 3:
+                    observed = next(stream, "").split()
+                    number = observed[-1].lstrip("-") if observed else "0"
+                    if len(observed) % 3 or not number.isdecimal():
                         raise ValueError(
                             f"no line of observations follows that of {words[-1]};"
                             " an empty line is enough"
