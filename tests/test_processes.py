@@ -220,5 +220,5 @@ def test_the_quota_of_a_container_bounds_the_threads(
     assert processes.cores() == 1
     monkeypatch.setenv("PYTHON_CPU_COUNT", "default")
     monkeypatch.setenv("OMP_NUM_THREADS", "0")
-    monkeypatch.setenv("OPENCV_FOR_THREADS_NUM", "9" * 5000)
+    monkeypatch.setenv("PYTHON_CPU_COUNT", "9" * 5000)
     assert processes.cores() == count

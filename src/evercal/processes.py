@@ -21,7 +21,7 @@ from multiprocessing.process import parent_process
 from pathlib import Path
 from typing import Any
 
-_COUNTS = ("OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "PYTHON_CPU_COUNT")
+_COUNTS = ("OMP_NUM_THREADS", "PYTHON_CPU_COUNT")
 """Variables that bound the number of threads."""
 _DIGITS = 10
 """Digits of a number that no longer bounds anything."""
