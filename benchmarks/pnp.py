@@ -110,7 +110,8 @@ def _changed(constant: str, value: float) -> Solver:
 
 
 def _opencv(pixels: Array, points: Array) -> SE3 | None:
-    focal = np.array([[262.5, 0, 159.5], [0, 262.5, 119.5], [0, 0, 1]])
+    focal = np.diag([_CAMERA.fx, _CAMERA.fy, 1.0])
+    focal[:2, 2] = _CAMERA.cx, _CAMERA.cy
     solved, turn, shift, _ = cv2.solvePnPRansac(
         points,
         pixels,
@@ -123,9 +124,7 @@ def _opencv(pixels: Array, points: Array) -> SE3 | None:
     )
     if not solved:
         return None
-    matrix = np.eye(4)
-    matrix[:3, :3] = cv2.Rodrigues(turn)[0]
-    matrix[:3, 3] = np.ravel(shift)
+    matrix = np.column_stack([cv2.Rodrigues(turn)[0], shift])
     return SE3.from_matrix(matrix).inverse()
 
 
@@ -133,7 +132,7 @@ def _poselib(pixels: Array, points: Array) -> SE3 | None:
     import poselib  # pyright: ignore[reportMissingImports]
 
     camera = {"model": "PINHOLE", "width": 0, "height": 0}
-    camera["params"] = [262.5, 262.5, 159.5, 119.5]
+    camera["params"] = [_CAMERA.fx, _CAMERA.fy, _CAMERA.cx, _CAMERA.cy]
     ransac = {
         "max_reproj_error": _OPTIONS.threshold_px,
         "max_iterations": 1000,

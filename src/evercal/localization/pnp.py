@@ -107,9 +107,7 @@ def _refined(
         rotation = rotation @ cv2.Rodrigues(step[3:])[0]
     error, _ = linearise(pixels, points_m, rotation, position, pinhole)
     inliers = (error**2).sum(0) < threshold_px**2
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    matrix[:3, 3] = position
+    matrix = np.column_stack([rotation, position])
     if inliers.sum() < MIN_INLIERS or not np.isfinite(matrix).all():
         return None
     return PnpResult(SE3.from_matrix(matrix), inliers)

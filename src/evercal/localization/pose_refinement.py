@@ -126,9 +126,7 @@ class Minimum:
 
     def pose(self, covariance: Array) -> UncertainPose:
         """points_from_camera with a covariance (6, 6) in camera axes."""
-        matrix = np.eye(4)
-        matrix[:3, :3] = self.rotation
-        matrix[:3, 3] = self.position
+        matrix = np.column_stack([self.rotation, self.position])
         pose = SE3.from_matrix(matrix)
         return UncertainPose(pose, in_parent_axes(self.rotation, covariance))
 

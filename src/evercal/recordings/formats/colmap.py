@@ -158,20 +158,21 @@ def _text(path: Path) -> Iterator[list[str]]:
     with path.open(encoding="utf-8-sig") as stream:
         for line in stream:
             words = line.split()
-            if words and line[0] != "#":
-                if len(words) < len(layout.split()):
-                    raise ValueError(f"{line.strip()[:80]!r} is not {layout}")
-                if path.stem == "images":
-                    # The name may have blanks; a line of observations follows.
-                    words = line.strip().split(maxsplit=9)
-                    observed = next(stream, "").split()
-                    number = observed[-1].lstrip("-") if observed else "0"
-                    if len(observed) % 3 or not number.isdecimal():
-                        raise ValueError(
-                            f"no line of observations follows that of {words[-1]};"
-                            " an empty line is enough"
-                        )
-                yield words
+            if not words or line[0] == "#":
+                continue
+            if len(words) < len(layout.split()):
+                raise ValueError(f"{line.strip()[:80]!r} is not {layout}")
+            if path.stem == "images":
+                # The name may have blanks; a line of observations follows.
+                words = line.strip().split(maxsplit=9)
+                observed = next(stream, "").split()
+                last = ["0", *observed][-1]
+                if len(observed) % 3 or not last.lstrip("-").isdecimal():
+                    raise ValueError(
+                        f"no line of observations follows that of {words[-1]};"
+                        " an empty line is enough"
+                    )
+            yield words
 
 
 def _binary(path: Path) -> Iterator[Sequence[Any]]:
