@@ -12,6 +12,8 @@ BoardKind = Literal["chessboard", "charuco", "apriltag", "aprilgrid", "arucogrid
 """Printed board: aprilgrid is Kalibr's, arucogrid OpenCV's GridBoard."""
 OnClash = Literal["refuse", "rename", "skip", "replace"]
 """What a merge of maps does with a scene whose name is taken."""
+ArmClass = Literal["industrial", "cobot", "hobby"]
+"""How accurate the joints of an arm are when it leaves the factory."""
 Motors = Literal["feetech", "dynamixel"]
 """Motors of an arm of LeRobot."""
 Preset = Literal["fast", "demo", "bench", "converged", "paper"]

@@ -1,6 +1,6 @@
 """`Arm`: a chain of joints from the base to the gripper; poses, and how each joint moves them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +37,11 @@ class Arm:
     """Joints that move, from the base to the gripper."""
     last: Array
     """(4, 4) from the frame after the last joint to the gripper."""
+    ranges: Array = field(default_factory=lambda: np.pi * np.arange(-1, 2))
+    """(k, 3) lower limit, usual value and upper limit of each value; or (3,) of all."""
+    name: str = "the arm"
+    controller_m: float = 0.0
+    """Height above the base of the frame in which its maker's controller states poses."""
 
     def rotates(self) -> BoolArray:
         """(k,) whether a value is an angle."""

@@ -144,7 +144,13 @@ class RobotModel:
                 before = np.eye(4)
             if backwards:
                 before = before @ np.linalg.inv(origin)
-        return Arm(tuple(names), tuple(chain), before)
+        drivers = [self._joint_named[name].numbers for name in names]
+        limits = [
+            numbers["limit lower"] + numbers["limit upper"] for numbers in drivers
+        ]
+        lower, upper = np.reshape(limits, (-1, 2)).clip(-np.pi, np.pi).T
+        ranges = np.stack([lower, (lower + upper) / 2, upper], 1)
+        return Arm(tuple(names), tuple(chain), before, ranges, self.path.name)
 
     def origins_with(self, offsets: Mapping[str, float]) -> dict[str, tuple[SE3, bool]]:
         """Origins of the joints that move by some values, with offsets of these values.

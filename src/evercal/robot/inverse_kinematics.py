@@ -1,0 +1,202 @@
+"""`inverse_kinematics`: joint values of stated gripper poses; tool and base are not known."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from evercal.errors import InputError
+from evercal.geometry import SE3, pose_distance
+from evercal.robot.arm import Arm
+from evercal.typing import Array, BoolArray
+
+_STARTS = 48
+"""Postures from which the middle pose is solved."""
+_BRANCHES = 8
+"""Solutions of the middle pose that are followed to other poses."""
+_FOLLOWED = 60
+"""Poses that decide which branch is taken."""
+_STEPS = 40
+_LONGEST_STEP = 0.5
+_LEVER_M = 0.3
+"""A rotation of one radian counts as so much translation."""
+_WEIGHTS = np.array([1.0] * 3 + [_LEVER_M] * 3)
+_REACHED_M = 1e-5
+_SLACK = 0.05
+"""Radians or metres by which a joint may exceed its limits."""
+_REST_WEIGHT = 0.1
+"""Distance from the usual posture, as a share of the motion between neighbours."""
+_TOOLS_M = (0.0, 0.1034, 0.05, 0.15, 0.2, 0.3)
+"""Lengths of a tool along the axis of the flange; the second is that of Franka's hand."""
+
+
+class Reached(NamedTuple):
+    """Joint values that reach the stated poses."""
+
+    arm: Arm
+    """With the tool and the base that reach them: its poses are the stated ones."""
+    values: Array
+    """(n, k) joint values."""
+    tool_m: float
+    """Length of the assumed tool."""
+
+
+def inverse_kinematics(poses: SE3, arm: Arm) -> Reached:
+    """Joint values of (n,) base_from_gripper, of one branch; their order does not matter.
+
+    The base on the floor and that of the controller, and tools along the flange, are tried in
+    turn; the first with which the arm reaches all poses counts.
+
+    Raises:
+        InputError: The arm reaches not all of them within its limits.
+    """
+    most = np.array([-1])
+    for candidate, tool_m in _candidates(arm):
+        values, reached = _solved(candidate, poses)
+        if reached.all():
+            return Reached(
+                candidate,
+                values,
+                tool_m,
+            )
+        most = max(
+            most,
+            reached,
+            key=np.sum,
+        )
+    lost = most.argmin()
+    raise InputError(
+        f"{arm.name}: does not reach pose {lost + 1} of {len(poses)}, at"
+        f" {poses.translation_m[lost].round(3)} m; name another arm, or give poses of the flange"
+        " in the base of the robot"
+    )
+
+
+def _candidates(arm: Arm) -> Iterator[tuple[Arm, float]]:
+    """The arm with bases and tools, the most common first, and the length of the tool."""
+    first, *others = arm.chain
+    for tool_m in _TOOLS_M:
+        for base_m in dict.fromkeys((0, arm.controller_m)):
+            base = SE3.from_translation([0, 0, -base_m]).matrix()
+            tool = SE3.from_translation([0, 0, tool_m]).matrix()
+            chain = (first._replace(before=base @ first.before), *others)
+            yield (
+                replace(
+                    arm,
+                    chain=chain,
+                    last=arm.last @ tool,
+                ),
+                tool_m,
+            )
+
+
+def _solved(arm: Arm, poses: SE3) -> tuple[Array, BoolArray]:
+    """Values (n, k) of the branch that moves least between similar poses, and which are reached."""
+    metres, radians = pose_distance(poses[:, None], poses)
+    distances = metres + _LEVER_M * radians
+    middle = distances.sum(0).argmin()
+    branches = _postures(arm, poses[[middle] * _STARTS])
+    if not len(branches):
+        return branches, np.zeros(len(poses), dtype=bool)
+    spread = np.linspace(
+        0,
+        len(poses) - 1,
+        _FOLLOWED,
+    ).astype(int)
+    some = np.unique([*spread, middle])
+    targets = np.tile(some, len(branches))
+    found = _iterate(
+        arm,
+        poses[targets],
+        branches.repeat(len(some), 0),
+    )
+    values = found[0].reshape(
+        len(branches),
+        len(some),
+        -1,
+    )
+    reached = found[1].reshape(len(branches), -1)
+    apart = distances[np.ix_(some, some)] + np.diag(np.full(len(some), np.inf))
+    steps = _away(
+        arm,
+        values,
+        values[:, apart.argmin(0)],
+    ).mean(1)
+    from_rest = _away(
+        arm,
+        values,
+        arm.ranges.T[1],
+    ).mean(1)
+    best = np.lexsort([steps + _REST_WEIGHT * from_rest, -reached.sum(1)])[0]
+    solved = reached[best]
+    nearest = distances[:, some[solved]].argmin(1)
+    return _iterate(
+        arm,
+        poses,
+        values[best][solved][nearest],
+    )
+
+
+def _postures(arm: Arm, same: SE3) -> Array:
+    """(b, k) values that reach one pose, repeated for each start; the most usual first."""
+    lower, rest, upper = arm.ranges.T
+    random = np.random.default_rng(0)
+    starts = random.uniform(
+        lower,
+        upper,
+        (_STARTS, len(arm.joints)),
+    )
+    starts[0] = rest
+    values, reached = _iterate(
+        arm,
+        same,
+        starts,
+    )
+    values = np.unique(values[reached].round(3), axis=0)
+    return values[
+        _away(
+            arm,
+            values,
+            rest,
+        ).argsort()[:_BRANCHES]
+    ]
+
+
+def _iterate(arm: Arm, poses: SE3, starts: Array) -> tuple[Array, BoolArray]:
+    """Damped least squares from values (m, k) to poses (m,), and which are reached."""
+    values = starts.copy()
+    misses = np.zeros(len(values))
+    lower, rest, upper = arm.ranges.T
+    active = np.arange(len(values))
+    for _ in range(_STEPS):
+        at = values[active]
+        miss = (arm.poses(at).inverse() @ poses[active]).log() * _WEIGHTS
+        slopes = arm.slopes(at) * _WEIGHTS[:, None]
+        misses[active] = np.linalg.norm(miss, axis=1)
+        damping = 1e-9 + 1e-2 * misses[active, None, None] ** 2
+        # Motions that leave the gripper where it is lead towards the usual posture.
+        aside = 0.5 * _turned(arm, rest - at)
+        miss -= (slopes @ aside[..., None])[..., 0]
+        back = slopes.swapaxes(1, 2)
+        gram = slopes @ back + damping * np.eye(6)
+        steps = aside + (back @ np.linalg.solve(gram, miss[..., None]))[..., 0]
+        longest = np.abs(steps).max(1)
+        shorter = np.minimum(1, _LONGEST_STEP / longest.clip(1e-9))
+        values[active] += steps * shorter[:, None]
+        active = active[longest > 1e-6]
+    middle = (lower + upper) / 2
+    values = middle + _turned(arm, values - middle)
+    inside = (values > lower - _SLACK) & (values < upper + _SLACK)
+    return values, inside.all(1) & (misses < _REACHED_M)
+
+
+def _away(arm: Arm, values: Array, others: Array) -> Array:
+    """(...,) mean difference of values (..., k)."""
+    return np.abs(_turned(arm, values - others)).mean(-1)
+
+
+def _turned(arm: Arm, differences: Array) -> Array:
+    """Differences of values (..., k); those of angles within half a turn."""
+    turns = np.round(differences / (2 * np.pi)) * arm.rotates()
+    return differences - 2 * np.pi * turns
