@@ -1,15 +1,26 @@
 """What a fixed camera sees of a thing in the gripper: masks, windows, and a thing that slips."""
 
+from dataclasses import replace
+from unittest.mock import MagicMock
+
 import cv2
 import numpy as np
 import pytest
 
 from evercal.calibration.from_map.hand_eye_start import HandEyeStart
 from evercal.calibration.from_map.image_pairs import ImagePair
-from evercal.calibration.held_thing.moving_parts import MovingPart, moving_parts
+from evercal.calibration.held_thing.moving_parts import (
+    MovingPart,
+    in_full_size,
+    moving_parts,
+    reduced,
+)
 from evercal.calibration.held_thing.slip import largest_step
+from evercal.calibration.held_thing.thing_map import of_whole_images
 from evercal.calibration.held_thing.windows import cropped, windows
 from evercal.geometry import SE3, Camera
+from evercal.mapping.map_frame import MapFrame
+from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.frame import Frame
 from evercal.robot.mount import EYE_TO_HAND
 
@@ -64,6 +75,33 @@ def test_what_stands_still_is_removed(noise: float, gain: float) -> None:
         away = cv2.dilate(mask.astype(np.uint8), np.ones((61, 61))) == 0
         left = frame.read_image()[away][:, 0].std()
         assert left < 0.35 * old.read_image()[away][:, 0].std()
+
+
+def test_a_reduced_frame_leads_back_to_the_whole_image() -> None:
+    frames, _ = frames_of(8, 1.0)
+    small = [reduced(frame, 120) for frame in frames]
+    assert small[0].read_image().shape == (120, 160, 3)
+    assert small[0].camera.resized(320, 240) == CAMERA
+    assert reduced(frames[0], 480).camera is CAMERA
+    moving, _ = moving_parts(small)
+    whole = in_full_size(moving[3], frames[3])
+    assert whole.camera is CAMERA
+    wall = np.abs(whole.read_image().astype(int) - frames[3].read_image())[..., 0]
+    assert (wall > 10).mean() > 0.3
+    assert whole.read_image().shape == (240, 320, 3)
+
+
+def test_a_map_of_reduced_images_or_windows_has_the_camera_of_whole_images() -> None:
+    small = CAMERA.resized(160, 120)
+    window = replace(CAMERA, width=90, height=90, cx=39.5, cy=49.5)
+    for built in (small, window):
+        moved = replace(built, fx=1.01 * built.fx, cx=built.cx + built.width / 160)
+        scene = SceneMap("thing", built, moved, MagicMock(), MapFrame(), 8)
+        whole = of_whole_images(scene, CAMERA)
+        assert whole.camera == CAMERA
+        assert whole.adjusted_camera.fx == pytest.approx(1.01 * CAMERA.fx)
+        shift = whole.adjusted_camera.cx - CAMERA.cx
+        assert shift == pytest.approx(2.0 if built is small else 90 / 160)
 
 
 def test_a_window_follows_the_thing_and_keeps_its_rays() -> None:

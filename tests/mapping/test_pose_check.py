@@ -159,3 +159,5 @@ def test_sift_clears_frames_that_the_encoder_suspects(
     monkeypatch.setattr("evercal.mapping.pose_check.epipolar_rays", lambda *_: None)
     check = check_poses(recording, suspicious(recording))
     assert (check.wrong.tolist(), check.untracked.tolist()) == ([], [6])
+    confirmed = {recording.frames[6].name}
+    assert not check_poses(recording, suspicious(recording), confirmed).excluded.size

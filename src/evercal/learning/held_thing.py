@@ -1,15 +1,21 @@
 """A fixed camera from images of a thing that the gripper holds, which becomes a scene."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 
-from evercal.calibration.from_map.hand_eye import HandEye, hand_eye_of
+from evercal.calibration.from_map.hand_eye import hand_eye_of
 from evercal.calibration.from_map.hand_eye_start import (
+    SURE_SHARE,
     HandEyeStart,
     gripper_frames,
     hand_eye_start,
 )
-from evercal.calibration.held_thing.moving_parts import moving_parts
+from evercal.calibration.held_thing.moving_parts import (
+    in_full_size,
+    moving_parts,
+    reduced,
+)
 from evercal.calibration.held_thing.slip import refuse_slip
 from evercal.calibration.held_thing.thing_map import (
     in_windows,
@@ -17,23 +23,33 @@ from evercal.calibration.held_thing.thing_map import (
     with_image_scatter,
 )
 from evercal.errors import InputError
+from evercal.features.encoder import Encoder
 from evercal.learning.located import localizer_of, located_poses
 from evercal.learning.posed import LearnedScene, cleared, require_usable, sized
 from evercal.learning.report import LearnReport
 from evercal.mapping.arm_offsets import with_offsets
 from evercal.mapping.build import MapOptions, build_map
+from evercal.mapping.built_map import BuiltMap
 from evercal.mapping.memory_budget import MemoryBudget
+from evercal.mapping.prepared_frames import WorkingSize
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.processes import one_product_thread
 from evercal.progress import OnProgress
 from evercal.recordings import posed_recording
 from evercal.recordings.frame import (
     MIN_GRIPPER_FRAMES,
+    Frame,
     Recording,
     lacks_camera_poses,
 )
 from evercal.recordings.held_out import HeldOutSplit, require_frames
 from evercal.robot.mount import EYE_TO_HAND
+
+WHOLE_SIDE = 960
+"""Short side of the images whose features are matched, pixels, where reduced ones do not suffice:
+the thing may be small."""
+SWEPT_FRAMES = 8
+"""Maximum number of frames that a keyframe is tracked in; with 12 the answer is the same."""
 
 
 @one_product_thread()
@@ -52,16 +68,27 @@ def learn_held_thing(
         on_progress: Called with the current step, how much of it is done, and its total.
     """
     began = time.perf_counter()
-    require_usable(recording)
     if not lacks_camera_poses(recording):
         require_frames(posed_recording(recording))
         raise InputError(
             f"scene {recording.name!r}: states camera poses; a camera is calibrated by a thing in"
             " the gripper from a recording that states gripper poses only"
         )
-    posed, start = _posed_by_gripper(recording, contents, on_progress)
+    frames = gripper_frames(recording)
+    small = [reduced(frame, WorkingSize().patches) for frame in frames]
+    require_usable(replace(recording, train=tuple(small)))
+    moving, _ = moving_parts(small)
+    whole = [in_full_size(*pair) for pair in zip(moving, frames, strict=True)]
+    start = _start(recording, moving, whole, contents.encoder, on_progress)
+    posed = in_windows(start.posed(recording, moving), whole, start)
     budget = replace(MemoryBudget.parse(None), least=MIN_GRIPPER_FRAMES)
-    options = replace(MapOptions().for_hand_eye(EYE_TO_HAND), arm=start.arm)
+    options = MapOptions().for_hand_eye(EYE_TO_HAND)
+    options = replace(
+        options,
+        arm=start.arm,
+        confirmed=start.confirmed,
+        swept_frames=SWEPT_FRAMES,
+    )
     options = sized(options, budget, contents)
     options = replace(options, metric=recording.metric)
     encoder = contents.encoder
@@ -72,39 +99,40 @@ def learn_held_thing(
     split = HeldOutSplit(posed.train, ())
     learned = LearnedScene(scene, built, split, recording.metric)
     report = learned.report(contents, began)
-    estimate = _estimate(learned, start, recording, contents)
+    refuse_slip(frames, built)
+    estimate = hand_eye_of(start, built, frames)
+    shown = _to_locate(small, built)
+    poses = located_poses(localizer_of(contents, scene), shown)
+    estimate = with_image_scatter(estimate, shown, poses)
     return scene, replace(report, hand_eye=estimate)
 
 
-def _posed_by_gripper(
-    recording: Recording, contents: MapContents, on_progress: OnProgress
-) -> tuple[Recording, HandEyeStart]:
-    """Windows around the thing with rough camera poses, and the first estimate."""
-    frames, _ = moving_parts(gripper_frames(recording))
-    encoder = contents.encoder
+def _start(
+    recording: Recording,
+    reduced: Sequence[Frame],
+    whole: Sequence[Frame],
+    encoder: Encoder,
+    on_progress: OnProgress,
+) -> HandEyeStart:
+    """The first estimate, from reduced images where they suffice."""
     try:
-        start = hand_eye_start(recording, frames, EYE_TO_HAND, encoder, on_progress)
+        start = hand_eye_start(recording, reduced, EYE_TO_HAND, encoder, on_progress)
+        if start.pairs >= max(len(reduced), SURE_SHARE * start.of_pairs):
+            return start
+    except InputError:
+        pass
+    try:
+        return hand_eye_start(
+            recording, whole, EYE_TO_HAND, encoder, on_progress, WHOLE_SIDE
+        )
     except InputError as error:
         raise InputError(f"{recording.name}: {error}") from None
-    return in_windows(start.posed(recording, frames), start), start
 
 
-def _estimate(
-    learned: LearnedScene,
-    start: HandEyeStart,
-    recording: Recording,
-    contents: MapContents,
-) -> HandEye:
-    """The calibration, with the scatter of whole images in the finished map."""
-    built = learned.built
-    frames = gripper_frames(recording)
-    refuse_slip(frames, built)
-    estimate = hand_eye_of(start, built, frames)
-    keyframes = built.keyframe_names
-    shown = [frame for frame in recording.train if frame.name not in keyframes]
-    shown = shown or list(recording.train)
+def _to_locate(frames: Sequence[Frame], built: BuiltMap) -> list[Frame]:
+    """Frames to locate in the finished map: those that are no keyframes, if there are any."""
+    others = [frame for frame in frames if frame.name not in built.keyframe_names]
+    others = others or list(frames)
     if built.hand_eye is not None and built.hand_eye.arm is not None:
-        shown = with_offsets(shown, built.hand_eye.arm)
-    shown = [frame for frame in shown if frame.base_from_gripper is not None]
-    localizer = localizer_of(contents, learned.scene)
-    return with_image_scatter(estimate, shown, located_poses(localizer, shown))
+        return with_offsets(others, built.hand_eye.arm)
+    return others

@@ -34,6 +34,7 @@ from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import select_farthest, spread_poses
 from evercal.mapping.stated_errors import velocity_of
 from evercal.mapping.tracks import (
+    SWEPT_FRAMES,
     KeyframeTracks,
     opened_keyframes,
     refine_depths,
@@ -69,6 +70,8 @@ class MapOptions:
     support_frames: int = 250
     """Frames that are adjusted beside the keyframes, spread by pose. The dense normal equations
     have six rows for each; more frames add time and no precision."""
+    swept_frames: int = SWEPT_FRAMES
+    """Maximum number of frames that a keyframe is tracked in."""
     metric: bool = True
     """Whether stated poses are in metres. Otherwise the map's unit follows from its depths."""
     adjust: bool = True
@@ -77,6 +80,8 @@ class MapOptions:
     """Rounds of tracking and adjusting; the second runs only if the first moved something."""
     arm: ArmOffsets | None = None
     """Joint offsets that the stated poses contain, in a hand-eye calibration; they are adjusted."""
+    confirmed: frozenset[str] = frozenset()
+    """Names of frames whose stated poses are known to agree with the images."""
     mount: Mount | None = None
     """Mount of a camera whose poses follow from those of a gripper; see `for_hand_eye`."""
 
@@ -132,7 +137,9 @@ def build_map(
     """
     options = options or MapOptions()
     prepared = _prepare(frames, encoder, options, on_progress)
-    tracks = opened_keyframes(prepared.frames, prepared.keyframes, on_progress)
+    tracks = opened_keyframes(
+        prepared.frames, prepared.keyframes, on_progress, options.swept_frames
+    )
     if not any(keyframe.confirmed.any() for keyframe in tracks):
         raise InputError(
             "no two training frames show the same surfaces with parallax: record views from at"
@@ -198,7 +205,7 @@ def _prepare(
     else:
         unit = scale
         prepared = prepared.in_unit(scale)
-    check = check_poses(prepared, pairs)
+    check = check_poses(prepared, pairs, options.confirmed)
     if options.mount is None:
         require_consistent(prepared, pairs, check)
     consistent = prepared.without(check.excluded)

@@ -8,7 +8,7 @@ The encoder mistakes one square of a chessboard for another, so this is only a s
 an essential matrix decide: they confirm the pose, contradict it, or cannot track the frame.
 """
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -90,8 +90,12 @@ def matched_pairs(recording: PreparedFrames) -> list[MatchedPair]:
     return matched
 
 
-def check_poses(recording: PreparedFrames, pairs: list[MatchedPair]) -> PoseCheck:
-    """Find frames whose stated pose contradicts most of their partners."""
+def check_poses(
+    recording: PreparedFrames,
+    pairs: list[MatchedPair],
+    confirmed: Set[str] = frozenset(),
+) -> PoseCheck:
+    """Find frames whose stated pose contradicts most of their partners, unless it is confirmed."""
     count = len(recording)
     sift = _SiftCheck(recording)
     contradicts = contradicting(recording, pairs)
@@ -108,6 +112,8 @@ def check_poses(recording: PreparedFrames, pairs: list[MatchedPair]) -> PoseChec
             break
         pairs_of_worst = (frames == worst).any(1)
         rest &= ~pairs_of_worst
+        if recording.frames[worst].name in confirmed:
+            continue
         partners = np.setdiff1d(frames[pairs_of_worst], [worst, *wrong, *untracked])
         agree, disagree = sift.votes(worst, partners.tolist())
         if not agree and not disagree:

@@ -84,12 +84,14 @@ class Observations(NamedTuple):
     """(m, 2, 2), see `patches.whitening`."""
 
 
-def open_keyframe(recording: PreparedFrames, frame: int) -> KeyframeTracks:
-    """Landmarks of a keyframe, with depths from a plane sweep over other frames."""
+def open_keyframe(
+    recording: PreparedFrames, frame: int, others: int = SWEPT_FRAMES
+) -> KeyframeTracks:
+    """Landmarks of a keyframe, with depths from a plane sweep over at most `others` frames."""
     view = recording.posed_cells(frame)
-    swept, _ = recording.swept(frame, SWEPT_FRAMES)
+    swept, _ = recording.swept(frame, others)
     inverse = swept.astype(np.float64)
-    near = recording.source_views(1 / inverse, view, SWEPT_FRAMES)
+    near = recording.source_views(1 / inverse, view, others)
     cell_px = recording.cell_px(frame)
     pixels, cells = detect(recording.grey[frame], view.grid, cell_px)
     has_ray = np.isfinite(recording.cameras[frame].unproject(pixels)).all(1)
@@ -110,11 +112,12 @@ def opened_keyframes(
     recording: PreparedFrames,
     frames: Sequence[int],
     on_progress: OnProgress,
+    others: int = SWEPT_FRAMES,
 ) -> list[KeyframeTracks]:
     """Open keyframes in parallel and refine their depths."""
 
     def open_one(frame: int) -> KeyframeTracks:
-        keyframe = open_keyframe(recording, frame)
+        keyframe = open_keyframe(recording, frame, others)
         refine_depths(recording, keyframe)
         return keyframe
 

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from evercal.geometry import SE3, Camera, cross_matrix
 from evercal.geometry.normal_equations import normal_pseudo_inverse
@@ -314,5 +314,5 @@ def _apart(
     count = min(_NEIGHBOURS + 1, pose.corners)
     near = np.asarray(KDTree(view.points_m).query(view.points_m, count)[1])
     apart = pose.residual_px - np.median(pose.residual_px[near[:, 1:]], 1)
-    sigma = float(np.median(np.abs(apart)) / norm.ppf(0.75))
+    sigma = float(np.median(np.abs(apart)) / ndtri(0.75))
     return np.linalg.norm(apart, axis=1), max(sigma, _MIN_SIGMA_PX)

@@ -35,6 +35,8 @@ FIRST_PAIRS = 40
 """Maximum number of pairs that first rotations are tried on."""
 FIRST_MATCHES = 10
 """Maximum number of matches of each of these pairs."""
+STEP = 1e-7
+"""Step of numerical derivatives, radians and metres."""
 X_SCALE = np.repeat([0.01, 0.1], 3)
 """Characteristic scale of the parameters: radians and metres (`x_scale` of SciPy)."""
 
@@ -117,22 +119,32 @@ class EpipolarFit:
         return x
 
     def distances(self, x: Array) -> Array:
-        """(m,) angles of matches from their epipolar planes, radians."""
-        camera = self.moving(x[6:]) @ self.transform(x).matrix()
-        first = camera[self.ends[:, 0]]
-        second = camera[self.ends[:, 1]]
+        """(..., m) angles of matches from their epipolar planes, radians.
+
+        `x` is (..., 6), or the parameters of one camera and of its arm.
+        """
+        moving = self.moving(x[..., 6:])
+        camera = moving @ self.transform(x).matrix()[..., None, :, :]
+        first = camera[..., self.ends[:, 0], :, :]
+        second = camera[..., self.ends[:, 1], :, :]
         second_from_first = np.linalg.inv(second) @ first
-        baseline = second_from_first[:, :3, 3]
-        length = np.linalg.norm(baseline, axis=1, keepdims=True)
+        baseline = second_from_first[..., :3, 3]
+        length = np.linalg.norm(baseline, axis=-1, keepdims=True)
         direction = baseline / np.maximum(length, 1e-9)
-        essential = cross_matrix(direction) @ second_from_first[:, :3, :3]
-        essential = essential[self.number]
-        in_second = np.einsum("mij,mj->mi", essential, self.first)
-        in_first = np.einsum("mji,mj->mi", essential, self.second)
-        squares = (in_second[:, :2] ** 2).sum(1)
-        squares = squares + (in_first[:, :2] ** 2).sum(1)
+        essential = cross_matrix(direction) @ second_from_first[..., :3, :3]
+        essential = essential[..., self.number, :, :]
+        in_second = (essential @ self.first[..., None])[..., 0]
+        in_first = (self.second[:, None] @ essential)[..., 0, :]
+        squares = (in_second[..., :2] ** 2).sum(-1)
+        squares = squares + (in_first[..., :2] ** 2).sum(-1)
         slope = np.sqrt(np.maximum(squares, 1e-12))
-        return (self.second * in_second).sum(1) / slope
+        return (self.second * in_second).sum(-1) / slope
+
+    def slopes(self, x: Array) -> Array:
+        """(m, 6) derivatives of `distances` at parameters (6,)."""
+        steps = np.concatenate([np.zeros((1, 6)), STEP * np.eye(6)])
+        at, *moved = self.distances(x + steps)
+        return (np.array(moved) - at).T / STEP
 
     def medians(self, x: Array) -> Array:
         """Median distance of the matches of each pair, radians."""
@@ -142,8 +154,9 @@ class EpipolarFit:
 
     def transform(self, x: Array) -> SE3:
         """parent_from_camera of parameters (6,)."""
-        rotation = Rotation.from_rotvec(x[:3]) * self.rotation
-        return SE3(rotation.as_quat(canonical=True, scalar_first=True), x[3:6])
+        rotation = Rotation.from_rotvec(x[..., :3]) * self.rotation
+        quaternion = rotation.as_quat(canonical=True, scalar_first=True)
+        return SE3(quaternion, x[..., 3:6])
 
 
 def first_rotation(poses: SE3, pairs: Sequence[ImagePair], mount: Mount) -> Rotation:
@@ -163,10 +176,12 @@ def first_rotation(poses: SE3, pairs: Sequence[ImagePair], mount: Mount) -> Rota
         fit = least_squares(
             epipolar.distances,
             np.mean(epipolar.starts(), axis=0),
+            jac=epipolar.slopes,  # pyright: ignore[reportArgumentType]
             loss="cauchy",
             f_scale=scale,
             x_scale=X_SCALE,
             max_nfev=15,
+            ftol=1e-3,
         )
         cost = np.minimum(np.abs(epipolar.distances(fit.x)), scale).mean()
         if cost < least:

@@ -15,7 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from evercal.calibration.from_map.epipolar_fit import EpipolarFit, first_rotation
-from evercal.calibration.from_map.image_pairs import ImagePair, image_pairs
+from evercal.calibration.from_map.image_pairs import (
+    MATCHING_SIDE,
+    ImagePair,
+    image_pairs,
+)
 from evercal.calibration.pose_pairs.checks import require_rotations
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
@@ -33,7 +37,7 @@ from evercal.recordings.held_out import require_frames
 from evercal.robot.arm import Arm
 from evercal.robot.arm_offsets import ArmOffsets
 from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount
-from evercal.typing import Array
+from evercal.typing import Array, IntArray
 
 FRAMES = 120
 """Maximum number of frames, spread by pose."""
@@ -67,6 +71,8 @@ class HandEyeStart:
     """Median angle of matches from their epipolar planes, median of the pairs."""
     arm: ArmOffsets | None = None
     """First offsets of the joints, where joint values are stated."""
+    confirmed: frozenset[str] = frozenset()
+    """Names of frames whose matches agree with it in more pairs than not."""
 
     def posed(self, recording: Recording, frames: Sequence[Frame]) -> Recording:
         """The recording with rough camera poses of `frames`; its other ones count as untracked."""
@@ -110,10 +116,12 @@ def hand_eye_start(
     mount: Mount,
     encoder: Encoder,
     on_progress: OnProgress = lambda *_: None,
+    side: int = MATCHING_SIDE,
 ) -> HandEyeStart:
     """Estimate the transform of a camera from frames that all have `base_from_gripper`.
 
-    If the recording has an arm and the frames state joint values, their offsets are estimated, too.
+    Features are matched in images whose shorter side has at most `side` pixels. If the recording
+    has an arm and the frames state joint values, their offsets are estimated, too.
     """
     arm = recording.arm if has_joints(frames) else None
     poses = scene_from_parent(frames, mount)
@@ -122,7 +130,7 @@ def hand_eye_start(
         spread = spread_poses(poses, FRAMES)
         frames = [frames[i] for i in spread]
         poses = poses[spread]
-    pairs = image_pairs(frames, mount, encoder, on_progress)
+    pairs = image_pairs(frames, mount, encoder, on_progress, side)
     joints = arm and Joints(arm, np.array([frame.joints_rad for frame in frames]))
     try:
         start = start_from_matches(poses, pairs, mount, joints)
@@ -131,7 +139,16 @@ def hand_eye_start(
         raise
     if start.pairs < SURE_SHARE * start.of_pairs:
         _refuse_other_mount(poses.inverse(), pairs, mount, start)
-    return start
+    votes = np.bincount(_ends(start.matches), minlength=len(frames))
+    least = np.maximum(np.bincount(_ends(pairs), minlength=len(frames)) / 2, 1)
+    judged = zip(frames, votes >= least, strict=True)
+    names = frozenset(frame.name for frame, agrees in judged if agrees)
+    return replace(start, confirmed=names)
+
+
+def _ends(pairs: Sequence[ImagePair]) -> IntArray:
+    """(2 n,) numbers of the frames of n pairs."""
+    return np.array([pair[:2] for pair in pairs], np.int64).ravel()
 
 
 def _refuse_other_mount(

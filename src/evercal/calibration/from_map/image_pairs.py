@@ -21,9 +21,7 @@ from evercal.typing import Array, Float32Array, Image
 PARTNERS = 6
 """Number of most similar frames that each frame is matched to."""
 MATCHING_SIDE = 480
-"""Short side of the images of a moving camera whose features are matched, pixels."""
-MATCHING_SIDE_FIXED = 960
-"""The same of a fixed camera, which shows a small thing."""
+"""Short side of the images whose features are matched, pixels, by default."""
 ENCODED_SIDE = 240
 """Short side of the images that are encoded, pixels."""
 LEAST_MOTION_PX = 2.0
@@ -44,12 +42,15 @@ def image_pairs(
     mount: Mount,
     encoder: Encoder,
     on_progress: OnProgress = lambda *_: None,
+    side: int = MATCHING_SIDE,
 ) -> list[ImagePair]:
-    """Similar frames with enough matches, without those of the background of a fixed camera."""
+    """Similar frames with enough matches, without those of the background of a fixed camera.
+
+    Features are matched in images whose shorter side has at most `side` pixels.
+    """
     images: list[Image] = []
     cameras: list[Camera] = []
     features: list[Float32Array] = []
-    side = MATCHING_SIDE if mount.moves else MATCHING_SIDE_FIXED
     least_motion_px = 0.0 if mount.moves else LEAST_MOTION_PX
     for frame in frames:
         image = frame.read_image()

@@ -48,6 +48,17 @@ class MovingPart(StoredImage):
         return without(pixels_of(self.image), self.moving)
 
 
+def reduced(frame: Frame, short_side: int) -> Frame:
+    """The frame with a smaller image in memory, if it is larger."""
+    image = frame.read_image()
+    if min(image.shape[:2]) <= short_side:
+        return replace(frame, image=image)
+    camera = frame.camera.short_side_resized(short_side)
+    size = camera.width, camera.height
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return replace(frame, image=np.asarray(small, np.uint8), camera=camera)
+
+
 def moving_parts(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], float]:
     """The frames without what stands still, and the share of their texture that stands still."""
     still, textured = _still([_compared(frame) for frame in frames])
@@ -57,6 +68,13 @@ def moving_parts(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], float]:
         image = MovingPart(frame.image, _opened(~stands & visible))
         moving.append(replace(frame, image=image))
     return tuple(moving), share
+
+
+def in_full_size(moving: Frame, frame: Frame) -> Frame:
+    """A frame of `moving_parts` with the image and camera of the frame that it was reduced from."""
+    assert isinstance(moving.image, MovingPart), "a frame of moving_parts"
+    image = replace(moving.image, image=frame.image)
+    return replace(moving, image=image, camera=frame.camera)
 
 
 def _compared(frame: Frame) -> NDArray[Any]:

@@ -12,18 +12,30 @@ from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.frame import Frame, Recording
 
 
-def in_windows(recording: Recording, start: HandEyeStart) -> Recording:
-    """The recording with windows around the thing instead of whole images, if it is small."""
-    around = windows(recording.train, start)
+def in_windows(
+    recording: Recording, whole: Sequence[Frame], start: HandEyeStart
+) -> Recording:
+    """The recording with windows around the thing instead of reduced images, if it is small.
+
+    Windows are cut from the images of `whole` (n,), which those of the recording were reduced from.
+    """
+    posed = start.posed(recording, whole).train
+    around = windows(posed, start)
     if around is None:
         return recording
-    return replace(recording, train=tuple(map(cropped, recording.train, around)))
+    return replace(recording, train=tuple(map(cropped, posed, around)))
 
 
 def of_whole_images(scene: SceneMap, whole: Camera) -> SceneMap:
-    """The map of a thing in the gripper, with the camera of whole images instead of windows."""
+    """The map of a thing in the gripper, with the camera of whole images.
+
+    It was built from windows, or from reduced images.
+    """
     window = scene.camera
-    adjusted = scene.adjusted_camera
+    width = round(window.width * whole.fx / window.fx)
+    height = round(window.height * whole.fy / window.fy)
+    window = window.resized(width, height)
+    adjusted = scene.adjusted_camera.resized(width, height)
     adjusted = replace(
         adjusted,
         width=whole.width,
