@@ -40,8 +40,9 @@ class Arm:
     ranges: Array = field(default_factory=lambda: np.pi * np.arange(-1, 2))
     """(k, 3) lower limit, usual value and upper limit of each value; or (3,) of all."""
     name: str = "the arm"
-    controller_m: float = 0.0
-    """Height above the base of the frame in which its maker's controller states poses."""
+    assumed: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+    """Heights of the stated base above its own, and lengths of a tool along the axis of its
+    gripper, that may be meant by stated poses; metres."""
 
     def rotates(self) -> BoolArray:
         """(k,) whether a value is an angle."""

@@ -1,6 +1,5 @@
 """`inverse_kinematics`: joint values of stated gripper poses; tool and base are not known."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,80 +14,69 @@ _STARTS = 48
 """Postures from which the middle pose is solved."""
 _BRANCHES = 8
 """Solutions of the middle pose that are followed to other poses."""
-_FOLLOWED = 60
+_FOLLOWED = 30
 """Poses that decide which branch is taken."""
-_STEPS = 40
+_STEPS = 25
 _LONGEST_STEP = 0.5
 _LEVER_M = 0.3
 """A rotation of one radian counts as so much translation."""
 _WEIGHTS = np.array([1.0] * 3 + [_LEVER_M] * 3)
-_REACHED_M = 1e-5
+_REACHED_M = 0.02
+"""Real arms differ from their maker's numbers."""
 _SLACK = 0.05
 """Radians or metres by which a joint may exceed its limits."""
 _REST_WEIGHT = 0.1
 """Distance from the usual posture, as a share of the motion between neighbours."""
-_TOOLS_M = (0.0, 0.1034, 0.05, 0.15, 0.2, 0.3)
-"""Lengths of a tool along the axis of the flange; the second is that of Franka's hand."""
+_MOST = 0.9
+"""Share of the poses that are reached, at least; the others are slips, or at the limits."""
 
 
 class Reached(NamedTuple):
     """Joint values that reach the stated poses."""
 
     arm: Arm
-    """With the tool and the base that reach them: its poses are the stated ones."""
+    """With a base and a tool with which its poses are the stated ones."""
     values: Array
     """(n, k) joint values."""
-    tool_m: float
-    """Length of the assumed tool."""
 
 
-def inverse_kinematics(poses: SE3, arm: Arm) -> Reached:
-    """Joint values of (n,) base_from_gripper, of one branch; their order does not matter.
+def inverse_kinematics(poses: SE3, arm: Arm) -> list[Reached]:
+    """Joint values of (n,) base_from_gripper, for each base and tool that may be meant.
 
-    The base on the floor and that of the controller, and tools along the flange, are tried in
-    turn; the first with which the arm reaches all poses counts.
+    They are of one branch; the order of the poses does not matter.
 
     Raises:
-        InputError: The arm reaches not all of them within its limits.
+        InputError: The arm reaches less than most of them within its limits.
     """
-    most = np.array([-1])
-    for candidate, tool_m in _candidates(arm):
-        values, reached = _solved(candidate, poses)
-        if reached.all():
-            return Reached(
-                candidate,
-                values,
-                tool_m,
-            )
-        most = max(
-            most,
-            reached,
-            key=np.sum,
+    answers: list[Reached] = []
+    for height_m, tool_m in arm.assumed:
+        first, *others = arm.chain
+        lifted = SE3.from_translation([0, 0, -height_m]).matrix() @ first.before
+        tool = SE3.from_translation([0, 0, tool_m]).matrix()
+        candidate = replace(
+            arm,
+            chain=(first._replace(before=lifted), *others),
+            last=arm.last @ tool,
         )
-    lost = most.argmin()
-    raise InputError(
-        f"{arm.name}: does not reach pose {lost + 1} of {len(poses)}, at"
-        f" {poses.translation_m[lost].round(3)} m; name another arm, or give poses of the flange"
-        " in the base of the robot"
-    )
-
-
-def _candidates(arm: Arm) -> Iterator[tuple[Arm, float]]:
-    """The arm with bases and tools, the most common first, and the length of the tool."""
-    first, *others = arm.chain
-    for tool_m in _TOOLS_M:
-        for base_m in dict.fromkeys((0, arm.controller_m)):
-            base = SE3.from_translation([0, 0, -base_m]).matrix()
-            tool = SE3.from_translation([0, 0, tool_m]).matrix()
-            chain = (first._replace(before=base @ first.before), *others)
-            yield (
-                replace(
-                    arm,
-                    chain=chain,
-                    last=arm.last @ tool,
-                ),
-                tool_m,
+        if answers:
+            start = answers[-1].values
+            values, reached = _iterate(
+                candidate,
+                poses,
+                start,
             )
+        else:
+            values, reached = _solved(candidate, poses)
+        if reached.mean() >= _MOST:
+            answers.append(Reached(candidate, values))
+    if not answers:
+        lost = reached.argmin()
+        raise InputError(
+            f"{arm.name}: does not reach pose {lost + 1} of {len(poses)}, at"
+            f" {poses.translation_m[lost].round(3)} m; name another arm, or give poses of the"
+            " flange in the base of the robot"
+        )
+    return answers
 
 
 def _solved(arm: Arm, poses: SE3) -> tuple[Array, BoolArray]:

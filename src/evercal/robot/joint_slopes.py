@@ -1,4 +1,6 @@
-"""`joint_slopes`: how offsets of an arm's joints move stated gripper poses."""
+"""`joint_slopes`: how offsets of an arm's inner joints move stated gripper poses."""
+
+from itertools import product
 
 import numpy as np
 
@@ -7,12 +9,17 @@ from evercal.robot.arm import Arm
 from evercal.robot.inverse_kinematics import inverse_kinematics
 from evercal.typing import Array
 
-_SHOULDER = 0.3
-"""Height of the shoulder of an unknown arm, as a share of the farthest gripper."""
-_WRIST = 0.12
-"""Length from its wrist to its gripper, likewise."""
-_LINK = 0.56
-"""Length of its two links, as a share of the farthest distance from shoulder to gripper."""
+_SHOULDERS = (0.15, 0.4)
+"""Heights of the shoulder of an unknown arm, as shares of the farthest gripper."""
+_WRISTS = (0.0, 0.2)
+"""Lengths from its wrist to its gripper, likewise."""
+_LINKS = (0.53, 0.8)
+"""Lengths of its two links, as shares of the farthest distance from shoulder to gripper."""
+_HEADINGS = (1, 0.3, 0.3, 1, 0.3, 1, 1, 0.3)
+"""How far its plane turns with the wrist, for each combination of these; an arm of seven axes has
+a plane of its own."""
+_WEIGHTS = np.array([1, 1, 1, 1, 0.7, 0.5, 0.5, 0.3])
+"""Axes that only some arms have count less."""
 
 
 def joint_slopes(poses: SE3, arm: Arm | None) -> Array:
@@ -20,70 +27,93 @@ def joint_slopes(poses: SE3, arm: Arm | None) -> Array:
 
     Translation and rotation in the axes of the gripper, for a radian, or a metre of a sliding
     joint; see `Arm.slopes`. The first and the last joint are left out: their offsets look like
-    those of the base and of the mount. Without an arm, the four inner joints of a usual one.
+    those of the base and of the mount. The bases and tools that may be meant, and without an arm
+    the proportions of eight usual ones, stand side by side: k is several times the number of
+    joints, and together they move the gripper as much as one of them.
 
     Raises:
-        InputError: The arm does not reach a pose.
+        InputError: The arm does not reach most poses.
     """
     if arm is None:
-        return _usual_slopes(poses)
-    reached = inverse_kinematics(poses, arm)
-    return reached.arm.slopes(reached.values)[:, :, 1:-1]
+        kinds = zip(
+            product(
+                _SHOULDERS,
+                _WRISTS,
+                _LINKS,
+            ),
+            _HEADINGS,
+            strict=True,
+        )
+        slopes = [
+            _usual(
+                poses,
+                *lengths,
+                heading,
+            )
+            for lengths, heading in kinds
+        ]
+    else:
+        answers = inverse_kinematics(poses, arm)
+        slopes = [at.arm.slopes(at.values)[:, :, 1:-1] for at in answers]
+    return np.concatenate(slopes, 2) / np.sqrt(len(slopes))
 
 
-def _usual_slopes(poses: SE3) -> Array:
-    """(n, 6, 4) of shoulder, elbow and two joints of the wrist, by its poses alone."""
+def _usual(
+    poses: SE3, height: float, tool: float, link: float, heading: float
+) -> Array:
+    """(n, 6, 8) of the joints that stand as an arm of these proportions would at its poses."""
     position = poses.translation_m
-    forward = poses.rotation_matrix()[:, :, 2]
+    gripper = poses.rotation_matrix()
+    forward = gripper[:, :, 2]
     reach = np.linalg.norm(position, axis=1).max()
-    shoulder = np.array([0, 0, _SHOULDER * reach])
-    wrist = position - _WRIST * reach * forward
+    shoulder = np.zeros_like(position)
+    shoulder[:, 2] = height * reach
+    wrist = position - tool * reach * forward
+    turn = wrist[:, 0] + 1j * wrist[:, 1]
+    middle = np.angle(turn.sum())
+    azimuth = middle + heading * np.angle(turn * np.exp(-1j * middle))
+    zero = np.zeros_like(azimuth)
+    ahead = np.stack([np.cos(azimuth), np.sin(azimuth), zero], 1)
+    side = np.cross([0, 0, 1], ahead)
     away = wrist - shoulder
-    distance = np.linalg.norm(
-        away,
-        axis=1,
-        keepdims=True,
+    half = (
+        np.linalg.norm(
+            away,
+            axis=1,
+            keepdims=True,
+        )
+        / 2
     )
-    link = _LINK * np.linalg.norm(position - shoulder, axis=1).max()
-    link = np.maximum(link, 0.51 * distance)
-    side = _unit(np.stack([-wrist[:, 1], wrist[:, 0], 0 * wrist[:, 0]], 1))
-    up = np.cross(_unit(away), side)
+    longest = np.linalg.norm(position - shoulder, axis=1).max()
+    link_m = np.maximum(link * longest, 1.02 * half)
+    up = _unit(np.cross(away, side))
     up *= np.where(
         up[:, 2:] < 0,
         -1,
         1,
     )
-    elbow = shoulder + away / 2 + up * np.sqrt(link**2 - distance**2 / 4)
+    elbow = shoulder + away / 2 + up * np.sqrt(link_m**2 - half**2)
+    upper = _unit(elbow - shoulder)
     fore = _unit(wrist - elbow)
-    bend = np.cross(fore, forward)
-    straight = (
-        np.linalg.norm(
-            bend,
-            axis=1,
-            keepdims=True,
-        )
-        < 0.05
-    )
-    bend = np.where(
-        straight,
-        side,
-        _unit(bend),
-    )
-    axes = np.stack([side, side, fore, bend], 2)
-    points = np.stack([np.broadcast_to(shoulder, wrist.shape), elbow, wrist, wrist], 2)
+    hinge = _unit(np.cross(upper, fore))
+    bend = _unit(np.cross(fore, forward))
+    across = _unit(np.cross(side, forward))
+    axes = [side, hinge, fore, bend, upper, side, across, ahead]
+    points = [shoulder, elbow, wrist, wrist, shoulder, wrist, wrist, shoulder]
+    turns = np.stack(axes, 2) * _WEIGHTS
     shifts = np.cross(
-        axes,
-        position[:, :, None] - points,
+        turns,
+        position[:, :, None] - np.stack(points, 2),
         axis=1,
     )
-    to_gripper = poses.rotation_matrix().swapaxes(1, 2)
-    return np.concatenate([to_gripper @ shifts, to_gripper @ axes], 1)
+    back = gripper.swapaxes(1, 2)
+    return np.concatenate([back @ shifts, back @ turns], 1)
 
 
 def _unit(vectors: Array) -> Array:
     lengths = np.linalg.norm(
         vectors,
-        axis=-1,
+        axis=1,
         keepdims=True,
     )
     return vectors / lengths.clip(1e-12)

@@ -3,6 +3,7 @@
 import json
 import re
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ _FILE = Path(__file__).with_name("arms.json")
 `links` are Craig's Denavit-Hartenberg parameters a, alpha, d, theta up to each joint and up to the
 flange, `rest` is a usual posture.
 """
+_TOOLS_M = (0.0, 0.1, 0.2, 0.3)
+"""Lengths of an unknown tool."""
 
 
 @cache
@@ -65,14 +68,16 @@ def known_arm(name: str) -> Arm:
         chain[sliding] = chain[sliding]._replace(rotates=False)
         ranges[sliding] *= 0.18 / np.pi
     joints = tuple(f"joint_{i + 1}" for i in range(len(chain)))
-    controller_m = arm.get("controller_mm", 0) / 1000
+    # Some controllers have their base frame where the first two axes meet.
+    heights = {0.0, arm.get("controller_mm", 0) / 1000}
+    assumed = tuple(product(heights, _TOOLS_M))
     return Arm(
         joints,
         tuple(chain),
         links[-1],
         ranges,
         names[0],
-        controller_m,
+        assumed,
     )
 
 
