@@ -36,6 +36,10 @@ VERBS = {
     "handeye": ("hand_eye", "pose pairs: errors, ellipsoids, outliers, scale, time"),
     "boards": ("boards", "detection of rendered boards, beside the finders of OpenCV"),
     "handeye-boards": ("hand_eye_boards", "boards and intrinsics from the same images"),
+    "board-errors": (
+        "board_errors",
+        "boards with a rolling shutter, a stretched print, a wrong lens",
+    ),
     "mistakes": ("mistakes", "mistakes in pose files, and clean recordings"),
     "recording-mistakes": (
         "recording_mistakes",

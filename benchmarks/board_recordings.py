@@ -48,6 +48,8 @@ class BoardSetting:
     square_m: float = 0.025
     bend_mm: float = 0.0
     """Departure of the board from a plane at 150 mm from its middle, where it bends most."""
+    stretch: float = 0.0
+    """Relative length by which the print is stretched along its columns."""
     dents_mm: float = 0.0
     """Height of two dented corners of the board; a dent is 60 mm long."""
 
@@ -98,6 +100,7 @@ def record(setting: BoardSetting, seed: int, session: int = 0) -> BoardRecording
     parent_from_camera, fixed_from_board = _places(setting, rng)
     true = board_points(setting, stated=False)
     stated = board_points(setting)
+    true[:, 1] *= 1 + setting.stretch
     if setting.bend_mm or setting.dents_mm:
         true = _bent(true, setting, rng)
     if session:

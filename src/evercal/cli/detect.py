@@ -91,6 +91,7 @@ class Detect(args.Verb):
         from evercal.calibration.boards.board_poses import board_poses
         from evercal.calibration.boards.corners import BoardView
         from evercal.calibration.boards.intrinsics import calibrate_camera
+        from evercal.calibration.boards.stated_lens import compared_lens
         from evercal.recordings.cameras.camera_file import read_camera_of_size
         from evercal.recordings.images import first_size
 
@@ -107,10 +108,13 @@ class Detect(args.Verb):
             camera = calibrate_camera(detected, width, height, self.lens).camera
             source = "board"
         poses = board_poses(board, camera, views, source)
+        warning = ""
+        if source == "file":
+            poses, warning = compared_lens(poses)
         poses.write(self.out)
         solve = ("solve", "--robot-poses", "FILE", "--camera-poses", self.out)
         then = (*solve, "--mount", "eye_in_hand")
-        self.answer(poses.to_dict(), *_lines(poses), then=then)
+        self.answer(poses.to_dict(), *_lines(poses, warning), then=then)
         return 0
 
     def _make(self, path: Path) -> int:
@@ -180,7 +184,7 @@ class Detect(args.Verb):
             return find_boards(list(by_name), read, board)
 
 
-def _lines(poses: "BoardPoses") -> Iterator[str]:
+def _lines(poses: "BoardPoses", warning: str) -> Iterator[str]:
     for image in poses.images:
         if image.camera_from_board is None:
             yield f"{image.name}: {image.reason}"
@@ -196,3 +200,5 @@ def _lines(poses: "BoardPoses") -> Iterator[str]:
         f" {poses.corner_sigma_px:.2f} px; camera (from the {poses.camera_from})"
         f" fx {camera.fx:.2f}, fy {camera.fy:.2f}, cx {camera.cx:.2f}, cy {camera.cy:.2f}"
     )
+    if warning:
+        yield f"warning: {warning}"

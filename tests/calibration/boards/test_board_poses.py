@@ -12,8 +12,9 @@ from evercal.calibration.boards.board_poses import (
     board_poses,
     read_board_poses,
 )
-from evercal.calibration.boards.corners import BoardView, board_pose, pixel_sigma
+from evercal.calibration.boards.corners import BoardView, board_pose
 from evercal.calibration.boards.intrinsics import calibrate_camera
+from evercal.calibration.boards.row_shift import CornerNoise
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 
@@ -60,9 +61,11 @@ def test_pixel_noise_is_estimated_from_all_images() -> None:
     fitted = [
         board_pose(view, CAMERA, pose) for view, pose in zip(views, poses, strict=True)
     ]
-    assert pixel_sigma(fitted) == pytest.approx(0.25, rel=0.1)
+    assert CornerNoise.plain(fitted).sigma_px == pytest.approx(0.25, rel=0.1)
     outlier = replace(fitted[0], residual_px=fitted[0].residual_px + 10)
-    assert pixel_sigma([outlier, *fitted[1:]]) == pytest.approx(0.25, rel=0.1)
+    assert CornerNoise.plain([outlier, *fitted[1:]]).sigma_px == pytest.approx(
+        0.25, rel=0.1
+    )
 
 
 def test_the_best_candidate_of_a_tag_is_returned_even_if_it_faces_the_camera() -> None:

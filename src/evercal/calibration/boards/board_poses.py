@@ -25,9 +25,9 @@ from evercal.calibration.boards.corners import (
     BoardView,
     Detection,
     board_pose,
-    pixel_sigma,
     strays,
 )
+from evercal.calibration.boards.row_shift import CornerNoise
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
@@ -138,7 +138,7 @@ def board_poses(
             fits[name] = board_pose(detected[name], camera, start)
     sigma = 0.0
     if fits:
-        sigma = pixel_sigma(list(fits.values()))
+        sigma = CornerNoise.plain(list(fits.values())).sigma_px
     images: list[BoardImage] = []
     for name, view in views.items():
         if name in fits:

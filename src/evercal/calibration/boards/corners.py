@@ -19,12 +19,14 @@ from evercal.geometry import SE3, Camera, cross_matrix
 from evercal.geometry.normal_equations import normal_pseudo_inverse
 from evercal.typing import Array, BoolArray
 
-_MIN_SIGMA_PX = 0.02
+MIN_SIGMA_PX = 0.02
 """Minimum standard deviation of a corner, due to errors of camera model and board."""
 _STRAY_SIGMAS = 6.0
 """Distance of a stray corner from its neighbours, standard deviations."""
 _NEIGHBOURS = 8
 """Number of neighbours that a residual is compared with."""
+_MIN_TREND = 24
+"""Minimum number of corners from whose residuals a cubic trend over the board is taken first."""
 _MAX_STRAYS = 0.2
 """Maximum share of strays: a view with more is no view of the board."""
 _MAX_ITERATIONS = 20
@@ -65,6 +67,18 @@ Detection: TypeAlias = BoardView | str
 """The corners in an image, or the reason why there are none."""
 
 
+class CornerSlopes(NamedTuple):
+    """Derivatives of the (2 k,) coordinates of the corners of one image."""
+
+    by_pose: Array
+    """(2 k, 6) by the pose."""
+    by_lens: Array
+    """(2 k, q) by the intrinsics and the bend."""
+    by_rows: Array
+    """(2 k, 4) by motions of the last row of the image against the first: shifts in x and in y,
+    and a roll and a zoom that shift what is one height from the principal point as far."""
+
+
 @dataclass(frozen=True, eq=False)
 class BoardPose:
     """Least-squares pose of the board in one image."""
@@ -81,6 +95,17 @@ class BoardPose:
     """(q, q) information on the intrinsics for a corner noise of one pixel, the pose unknown."""
     lens_gradient: Array
     """(q,) `lens_normal` times the change of the intrinsics that fits the corners best."""
+    slopes: CornerSlopes
+
+    def weighted(self, row_ratio: float) -> "BoardPose":
+        """Return the pose that allows for shifts that grow with the row.
+
+        Args:
+            row_ratio: Standard deviation of the shift over the image height, over that of a corner.
+        """
+        return _fitted(
+            self.camera_from_board, self.residual_px.ravel(), self.slopes, row_ratio
+        )
 
     @property
     def corners(self) -> int:
@@ -100,22 +125,24 @@ class BoardPose:
 
 _POWERS = [(i, order - i) for order in (2, 3, 4) for i in range(order + 1)]
 """Powers of x and y of the terms of a bend."""
-BEND = tuple(f"bend {'x' * i}{'y' * j}" for i, j in _POWERS)
-"""Names of these terms."""
+BEND = ("stretch", "shear", *(f"bend {'x' * i}{'y' * j}" for i, j in _POWERS))
+"""Names of the terms of a `Bend`."""
 
 
 class Bend(NamedTuple):
-    """How a board departs from a plane: z = size^2 times the sum of curvature x^i y^j / (i! j!).
+    """How a board departs from its drawing: its columns are stretched and sheared, and it is bent.
 
-    x and y are measured from the middle, in units of `size`.
+    z = size^2 times the sum of curvature x^i y^j / (i! j!). x and y are measured from the middle,
+    in units of `size`.
     """
 
     middle: Array
     """(3,) metres."""
     size: float
     """Half of the longer side, metres."""
-    curvature: Array
-    """(b,) 1 / metres, in the order of `BEND`."""
+    terms: Array
+    """(b,) in the order of `BEND`: a relative length, an angle in radians, and curvatures in
+    1 / metres."""
 
     @classmethod
     def none(cls, views: Sequence[BoardView]) -> "Bend":
@@ -129,10 +156,14 @@ class Bend(NamedTuple):
         )
 
     def slopes(self, points: Array) -> Array:
-        """Return the (k, b) derivative of z of points (k, 3) by the curvature."""
+        """Return the (k, 3, b) derivative of points (k, 3) by the terms."""
         x, y, _ = (points - self.middle).T / self.size
-        terms = [x**i * y**j / (factorial(i) * factorial(j)) for i, j in _POWERS]
-        return self.size**2 * np.stack(terms, 1)
+        bent = [x**i * y**j / (factorial(i) * factorial(j)) for i, j in _POWERS]
+        slopes = np.zeros((len(points), 3, len(BEND)))
+        slopes[:, 1, 0] = self.size * y
+        slopes[:, 0, 1] = self.size * y
+        slopes[:, 2, 2:] = self.size**2 * np.stack(bent, 1)
+        return slopes
 
 
 def lens_vector(camera: Camera) -> Array:
@@ -153,7 +184,7 @@ def board_pose(
         return min(fits, key=lambda pose: pose.squared_px)
     bend = bend or Bend.none([view])
     by_bend = bend.slopes(view.points_m)
-    points = view.points_m + np.outer(by_bend @ bend.curvature, [0, 0, 1])
+    points = view.points_m + by_bend @ bend.terms
     rotvec, translation = _refined(points, view.pixels, camera, start)
     projected, by_pose, by_camera = _projected(points, camera, rotvec, translation)
     rotation = Rotation.from_rotvec(np.ravel(rotvec))
@@ -161,19 +192,48 @@ def board_pose(
     by_point = by_pose[:, 3:].reshape(-1, 2, 3)
     by_rotation = by_point @ (-matrix @ cross_matrix(points))
     jacobian = np.concatenate([by_point, by_rotation], 2).reshape(-1, 6)
-    residual = (view.pixels - projected).ravel()
-    covariance = normal_pseudo_inverse(jacobian.T @ jacobian, 1e-12)
-    by_curvature = by_point @ matrix[:, 2:] * by_bend[:, None]
-    by_lens = np.c_[by_camera, by_curvature.reshape(-1, len(BEND))]
-    lens_slope = -covariance @ (jacobian.T @ by_lens)
-    unexplained = by_lens + jacobian @ lens_slope
+    by_shape = by_point @ matrix @ by_bend
+    by_lens = np.c_[by_camera, by_shape.reshape(-1, len(BEND))]
+    slopes = CornerSlopes(jacobian, by_lens, _by_rows(view.pixels, camera))
+    pose = SE3.of(rotation, np.ravel(translation))
+    return _fitted(pose, (view.pixels - projected).ravel(), slopes)
+
+
+def _by_rows(pixels: Array, camera: Camera) -> Array:
+    """Return (2 k, 4) shifts in x and y, a roll and a zoom that grow with the row."""
+    x, y = ((pixels - [camera.cx, camera.cy]) / camera.height).T
+    one = np.ones_like(x)
+    zero = np.zeros_like(x)
+    moves = np.array([[one, zero, -y, x], [zero, one, x, y]])
+    return (y * moves).transpose(2, 0, 1).reshape(-1, 4)
+
+
+def _fitted(
+    pose: SE3, residual: Array, slopes: CornerSlopes, row_ratio: float = 0.0
+) -> BoardPose:
+    """One step of weighted least squares from residuals (2 k,); see `BoardPose.weighted`."""
+    jacobian, by_lens, by_rows = slopes
+    axes, sizes, _ = np.linalg.svd(by_rows, full_matrices=False)
+    shrunk = axes * (1 - (1 + (row_ratio * sizes) ** 2) ** -0.5)
+
+    def whitened(values: Array) -> Array:
+        return values - shrunk @ (axes.T @ values)
+
+    white = whitened(jacobian)
+    covariance = normal_pseudo_inverse(white.T @ white, 1e-12)
+    gain = covariance @ white.T
+    step = gain @ whitened(residual)
+    lens_slope = -gain @ whitened(by_lens)
+    unexplained = whitened(by_lens + jacobian @ lens_slope)
+    moved = SE3(pose.rotation_wxyz, pose.translation_m + step[:3])
     return BoardPose(
-        camera_from_board=SE3.of(rotation, np.ravel(translation)),
+        camera_from_board=moved @ SE3.exp(np.r_[np.zeros(3), step[3:]]),
         unit_covariance=(covariance + covariance.T) / 2,
-        residual_px=residual.reshape(-1, 2),
+        residual_px=(residual - jacobian @ step).reshape(-1, 2),
         lens_slope=lens_slope,
         lens_normal=unexplained.T @ unexplained,
-        lens_gradient=unexplained.T @ residual,
+        lens_gradient=unexplained.T @ whitened(residual),
+        slopes=slopes,
     )
 
 
@@ -263,16 +323,6 @@ def board_pose_candidates(
     return poses
 
 
-def pixel_sigma(poses: Sequence[BoardPose]) -> float:
-    """Return the standard deviation of a corner coordinate in pixels, over images that fit well."""
-    squared = np.array([pose.squared_px for pose in poses])
-    freedom = np.array([max(2 * pose.corners - 6, 1) for pose in poses])
-    variance = squared / freedom
-    inliers = variance <= 4 * np.median(variance) + 1e-12
-    sigma = np.sqrt(squared[inliers].sum() / freedom[inliers].sum())
-    return max(float(sigma), _MIN_SIGMA_PX)
-
-
 def strays(
     views: Sequence[BoardView],
     poses: Sequence[BoardPose],
@@ -311,8 +361,14 @@ def _apart(
     pose: BoardPose,
 ) -> tuple[Array, float]:
     """Return distances (k,) of the residuals from the median of their neighbours, and sigma."""
+    residual = pose.residual_px
+    if pose.corners >= _MIN_TREND:
+        # A lens, a print or a shutter that the model lacks moves whole parts of the board.
+        x, y, _ = (view.points_m - view.points_m.mean(0)).T / np.ptp(view.points_m)
+        trend = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], 1)
+        residual = residual - trend @ np.linalg.lstsq(trend, residual, rcond=None)[0]
     count = min(_NEIGHBOURS + 1, pose.corners)
     near = np.asarray(KDTree(view.points_m).query(view.points_m, count)[1])
-    apart = pose.residual_px - np.median(pose.residual_px[near[:, 1:]], 1)
+    apart = residual - np.median(residual[near[:, 1:]], 1)
     sigma = float(np.median(np.abs(apart)) / ndtri(0.75))
-    return np.linalg.norm(apart, axis=1), max(sigma, _MIN_SIGMA_PX)
+    return np.linalg.norm(apart, axis=1), max(sigma, MIN_SIGMA_PX)

@@ -18,9 +18,9 @@ from evercal.calibration.boards.corners import (
     BoardView,
     board_pose,
     lens_vector,
-    pixel_sigma,
     strays,
 )
+from evercal.calibration.boards.row_shift import CornerNoise
 from evercal.choices import CameraModel
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
@@ -53,6 +53,9 @@ _STATED_DISTORTION_SIGMA = {
 _BEND_SIGMA = 0.15
 """Standard deviation of the curvatures of a board, 1 / metres: over 300 mm, the second
 order moves the edges by 1.7 mm, the third by 0.6 mm and the fourth by 0.1 mm."""
+_STRETCH_SIGMA = 0.005
+"""Standard deviation of the ratio of the sides of a printed square from 1, and of the angle between
+them from 90 degrees, radians."""
 _HALF_ANGLES_DEG = (35, 45, 55, 65, 75, 85, 95, 110)
 """Candidates for half of the horizontal field of view of a fisheye."""
 _MAX_FOCAL_SIGMA = 0.1
@@ -106,7 +109,8 @@ class LensPrior(NamedTuple):
         cls, mean: Array, sigma_px: float, sigma_terms: Sequence[float]
     ) -> "LensPrior":
         sigma = np.r_[np.full(4, sigma_px), sigma_terms][: len(mean)]
-        sigma = np.r_[sigma, np.full(len(BEND), _BEND_SIGMA)]
+        sigma = np.r_[sigma, np.full(2, _STRETCH_SIGMA)]
+        sigma = np.r_[sigma, np.full(len(BEND) - 2, _BEND_SIGMA)]
         return cls(
             np.r_[mean, np.zeros(len(BEND))],
             np.diag(sigma**-2.0),
@@ -136,7 +140,7 @@ def lens_estimate(
     information = np.sum([pose.lens_normal for pose in poses], 0) / variance
     information = information + prior.information
     gradient = np.sum([pose.lens_gradient for pose in poses], 0) / variance
-    deviation = prior.mean - np.r_[lens_vector(camera), bend.curvature]
+    deviation = prior.mean - np.r_[lens_vector(camera), bend.terms]
     gradient = gradient + prior.information @ deviation
     return normal_solution(information, gradient), information
 
@@ -148,7 +152,7 @@ def moved_lens(
 ) -> tuple[Camera, Bend]:
     """Return camera and bend after a (q,) change; ValueError without a positive focal length."""
     of_camera, of_bend = np.split(change, [-len(BEND)])
-    moved = bend._replace(curvature=bend.curvature + of_bend)
+    moved = bend._replace(terms=bend.terms + of_bend)
     return moved_camera(camera, of_camera), moved
 
 
@@ -198,7 +202,7 @@ def calibrate_camera(
     try:
         poses = [board_pose(view, camera) for view in views]
         for _ in range(_MAX_ROUNDS):
-            sigma_px = pixel_sigma(poses)
+            sigma_px = CornerNoise.plain(poses).sigma_px
             change, information = lens_estimate(poses, sigma_px, camera, bend, prior)
             largest = np.abs(change[:2]).max()
             change = change * min(1.0, _MAX_FOCAL_STEP * camera.fx / largest)

@@ -17,7 +17,6 @@ from evercal.calibration.boards.corners import (
     Bend,
     BoardPose,
     BoardView,
-    pixel_sigma,
     strays,
 )
 from evercal.calibration.boards.intrinsics import (
@@ -26,6 +25,7 @@ from evercal.calibration.boards.intrinsics import (
     fitted_poses,
     lens_estimate,
 )
+from evercal.calibration.boards.row_shift import CornerNoise
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.poses.conventions import PoseConvention
@@ -258,8 +258,12 @@ class Measured(NamedTuple):
     camera: Camera
     bend: Bend
     poses: list[BoardPose]
-    sigma_px: float
-    """Standard deviation of a corner coordinate."""
+    noise: CornerNoise
+
+    @property
+    def sigma_px(self) -> float:
+        """Standard deviation of a corner coordinate."""
+        return self.noise.sigma_px
 
     def applied_to(self, pairs: PosePairs) -> PosePairs:
         """Return the pairs with these camera poses and their covariances."""
@@ -288,12 +292,21 @@ class Measured(NamedTuple):
 
 
 def measured(
-    corners: BoardCorners, camera: Camera, starts: SE3, bend: Bend | None = None
+    corners: BoardCorners,
+    camera: Camera,
+    starts: SE3,
+    bend: Bend | None = None,
+    most_shift_px: float = 0.0,
 ) -> Measured:
-    """Fit the pose of the board in every image from (n,) starts."""
+    """Fit the pose of the board in every image from (n,) starts.
+
+    Shifts with the row are at most `most_shift_px`. They would explain wrong intrinsics, too, so
+    they are estimated only after these.
+    """
     bend = bend or Bend.none(corners.views)
     poses = fitted_poses(corners.views, camera, starts, bend)
-    return Measured(camera, bend, poses, pixel_sigma(poses))
+    noise = CornerNoise.of(poses, most_shift_px)
+    return Measured(camera, bend, noise.weighted(poses), noise)
 
 
 def middle_of(corners: BoardCorners | None) -> Array:

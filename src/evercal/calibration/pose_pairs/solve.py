@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evercal.calibration.boards.corners import board_pose, lens_vector
+from evercal.calibration.boards.corners import board_pose
 from evercal.calibration.boards.intrinsics import moved_lens
+from evercal.calibration.boards.row_shift import CornerNoise
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.pose_pairs.checks import (
     SIZE_SIGMA,
@@ -16,6 +17,7 @@ from evercal.calibration.pose_pairs.checks import (
     widened,
     with_tested_size,
 )
+from evercal.calibration.pose_pairs.corner_warnings import corner_warnings
 from evercal.calibration.pose_pairs.fit import (
     Agreement,
     HandEyeFit,
@@ -46,12 +48,10 @@ _OTHER_MOUNT = 4.0
 """Ratio of that distance to the distance of what the base carries, above which it may be."""
 _SCALE_SIGMA = 0.1
 """Maximum relative standard deviation of an unknown scale."""
-_MAX_LENSES = 8
+_MAX_LENSES = 12
 """Maximum number of changes of the intrinsics."""
 _SAME_LENS = 0.01
 """Squared Mahalanobis length of a change of the intrinsics that is ignored."""
-_LENS_WARNING = 3.0
-"""Deviation of stated intrinsics from the estimate that is reported, standard deviations."""
 
 
 def solve(
@@ -117,7 +117,8 @@ def solve_pose_pairs(
     if slip is not None:
         fit = replace(fit, covariance=fit.covariance + slip.spread)
         warnings.append(_slip_warning(slip, pairs.names, of_board))
-    warnings += _lens_warnings(fit, equation, corners, lens)
+    if corners is not None and lens is not None:
+        warnings += corner_warnings(fit, equation, corners, lens)
     if of_board:
         warnings += _mount_warnings(fit.at, mount)
     used = pairs[rows[fit.inliers]]
@@ -217,6 +218,7 @@ class _Problem:
         shifts[1] += start.rotations[1] @ middle_of(self.corners)
         at = replace(start, translations=shifts)
         accepted = np.ones(len(pairs), dtype=bool)
+        with_shift = False
         for remaining in reversed(range(_MAX_LENSES)):
             equation = self.equation(pairs, lens, accepted)[rows]
             at = replace(at, extras=np.zeros(len(equation.extras.names)))
@@ -232,14 +234,18 @@ class _Problem:
             length2 = change @ information @ change
             same = (accepted == before).all() and length2 < _SAME_LENS
             # A pose at the threshold of rejection may alternate for ever, and the lens with it.
+            most_shift_px = lens.noise.row_shift_px
             if same or (not remaining and length2 < len(change)):
-                return equation, fit, lens
+                if with_shift or not CornerNoise.of(lens.poses).row_shift_px:
+                    return equation, fit, lens
+                with_shift = True
+                most_shift_px = np.inf
             try:
                 camera, bend = moved_lens(lens.camera, lens.bend, change)
             except ValueError:
                 break
             poses = SE3.stack([pose.camera_from_board for pose in lens.poses])
-            lens = measured(self.corners, camera, poses, bend)
+            lens = measured(self.corners, camera, poses, bend, most_shift_px)
         raise InputError(
             "the corners and the robot's motions leave the intrinsics open; tilt the board by 20 to"
             " 45 deg in several directions, or give `camera` to evercal detect"
@@ -278,26 +284,6 @@ class _Problem:
         if pairs.velocity is not None:
             extras = extras.with_one("clock", np.zeros((len(pairs), 6)), np.inf)
         return moved.equation(self.mount, extras)
-
-
-def _lens_warnings(
-    fit: HandEyeFit,
-    equation: PoseEquation,
-    corners: BoardCorners | None,
-    lens: Measured | None,
-) -> list[str]:
-    if corners is None or lens is None or not corners.stated:
-        return []
-    stated = corners.prior
-    change = fit.at.extras[equation.extras.indices("intrinsics")][0]
-    now = lens_vector(lens.camera)[0] + change
-    sigma = stated.information[0, 0] ** -0.5
-    if abs(now - stated.mean[0]) < _LENS_WARNING * sigma:
-        return []
-    return [
-        f"the stated focal length is {stated.mean[0]:.1f} px, corners and motions give {now:.1f}"
-        f" px: check `camera`, or omit it"
-    ]
 
 
 def _mount_warnings(at: Unknowns, mount: MountName) -> list[str]:
