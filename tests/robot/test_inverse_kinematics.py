@@ -52,7 +52,7 @@ def test_similar_poses_of_a_seven_axis_arm_have_similar_values() -> None:
 
 def test_an_arm_that_is_too_short_is_named_with_the_pose() -> None:
     poses = known_arm("ur10e").poses(_postures("ur10e", 0.5))
-    with pytest.raises(InputError, match=r"ur3e: does not reach pose \d+ of 20, at"):
+    with pytest.raises(InputError, match=r"ur3e: does not reach pose \d+ of 20;"):
         inverse_kinematics(poses, known_arm("ur3e"))
 
 

@@ -1,5 +1,6 @@
 import json
 from importlib import resources
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -7,7 +8,13 @@ import pytest
 
 from evercal.choices import ArmClass
 from evercal.errors import InputError
-from evercal.robot.known_arms import ARM_NAMES, known_arm
+from evercal.robot.known_arms import (
+    ARM_NAMES,
+    USUAL_RAD,
+    arm_of,
+    known_arm,
+    offset_rad,
+)
 
 
 def test_a_ur5e_stands_as_its_maker_draws_it() -> None:
@@ -40,6 +47,37 @@ def test_the_table_is_plain_json() -> None:
 
 def test_another_name_is_refused_with_those_that_are_known() -> None:
     with pytest.raises(
-        InputError, match="arm 'ur6' is not known; give a URDF, or one of ur3, ur5"
+        InputError, match="arm 'ur6' is not known; give a URDF, or one of ur3"
     ):
-        known_arm("ur6")
+        arm_of("ur6")
+
+
+def test_an_arm_is_named_or_given_by_its_urdf(tmp_path: Path) -> None:
+    joint = '<joint name="{}" type="revolute"><parent link="{}"/><child link="{}"/>{}</joint>'
+    limit = '<limit lower="-0.5" upper="2.5"/>'
+    links = "".join(f'<link name="{link}"/>' for link in "abc")
+    turns = joint.format("j", "a", "b", limit) + joint.format("k", "b", "c", limit)
+    file = tmp_path / "robot.urdf"
+    file.write_text(f'<robot name="r">{links}{turns}</robot>')
+    arm = arm_of(str(file))
+    assert arm.joints == ("j", "k")
+    np.testing.assert_allclose(arm.ranges, [[-0.5, 1, 2.5]] * 2)
+    assert arm.assumed == ((0, 0),)
+    assert len(arm_of(str(file), "b", "c").joints) == 1
+    assert arm_of("UR5e").name == "ur5e"
+
+
+def test_an_accuracy_is_that_of_the_joints_or_of_the_gripper() -> None:
+    arm = known_arm("so101")
+    slopes = np.zeros((4, 6, 2))
+    slopes[:, 0] = np.array([0.3, 0.4])
+    assert offset_rad(None, arm, slopes) == USUAL_RAD["hobby"]
+    assert offset_rad(None, None, slopes) == USUAL_RAD["cobot"]
+    assert offset_rad("0.2deg", arm, slopes) == np.radians(0.2)
+    assert offset_rad("1.5 mm", arm, slopes) == pytest.approx(0.003)
+
+
+@pytest.mark.parametrize("text", ["0.2", "0deg", "-1mm", "1mm2", "nan deg", "0.2 rad"])
+def test_another_accuracy_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match=r"`arm_accuracy` .* such as 0.2deg"):
+        offset_rad(text, None, np.ones((1, 6, 1)))

@@ -16,8 +16,9 @@ _BRANCHES = 8
 """Solutions of the middle pose that are followed to other poses."""
 _FOLLOWED = 30
 """Poses that decide which branch is taken."""
-_STEPS = 25
+_STEPS = 20
 _LONGEST_STEP = 0.5
+_DAMPING = 1e-6
 _LEVER_M = 0.3
 """A rotation of one radian counts as so much translation."""
 _WEIGHTS = np.array([1.0] * 3 + [_LEVER_M] * 3)
@@ -26,7 +27,7 @@ _REACHED_M = 0.02
 _SLACK = 0.05
 """Radians or metres by which a joint may exceed its limits."""
 _REST_WEIGHT = 0.1
-"""Distance from the usual posture, as a share of the motion between neighbours."""
+"""Distance of a branch from the usual posture, as a share of the motion between poses."""
 _MOST = 0.9
 """Share of the poses that are reached, at least; the others are slips, or at the limits."""
 
@@ -35,7 +36,7 @@ class Reached(NamedTuple):
     """Joint values that reach the stated poses."""
 
     arm: Arm
-    """With a base and a tool with which its poses are the stated ones."""
+    """With a tool that may be meant; its base may be higher than the stated one."""
     values: Array
     """(n, k) joint values."""
 
@@ -49,54 +50,47 @@ def inverse_kinematics(poses: SE3, arm: Arm) -> list[Reached]:
         InputError: The arm reaches less than most of them within its limits.
     """
     answers: list[Reached] = []
+    lost = 0
     for height_m, tool_m in arm.assumed:
-        first, *others = arm.chain
-        lifted = SE3.from_translation([0, 0, -height_m]).matrix() @ first.before
+        lifted = SE3.from_translation([0, 0, height_m]) @ poses
         tool = SE3.from_translation([0, 0, tool_m]).matrix()
-        candidate = replace(
-            arm,
-            chain=(first._replace(before=lifted), *others),
-            last=arm.last @ tool,
-        )
+        longer = replace(arm, last=arm.last @ tool)
         if answers:
-            start = answers[-1].values
             values, reached = _iterate(
-                candidate,
-                poses,
-                start,
+                longer,
+                lifted,
+                answers[-1].values,
             )
         else:
-            values, reached = _solved(candidate, poses)
+            values, reached = _solved(longer, lifted)
         if reached.mean() >= _MOST:
-            answers.append(Reached(candidate, values))
-    if not answers:
+            answers.append(Reached(longer, values))
         lost = reached.argmin()
+    if not answers:
         raise InputError(
-            f"{arm.name}: does not reach pose {lost + 1} of {len(poses)}, at"
-            f" {poses.translation_m[lost].round(3)} m; name another arm, or give poses of the"
-            " flange in the base of the robot"
+            f"{arm.name}: does not reach pose {lost + 1} of {len(poses)}; name another"
+            " arm, or give poses of the flange in the base of the robot"
         )
     return answers
 
 
 def _solved(arm: Arm, poses: SE3) -> tuple[Array, BoolArray]:
     """Values (n, k) of the branch that moves least between similar poses, and which are reached."""
-    metres, radians = pose_distance(poses[:, None], poses)
-    distances = metres + _LEVER_M * radians
-    middle = distances.sum(0).argmin()
-    branches = _postures(arm, poses[[middle] * _STARTS])
-    if not len(branches):
-        return branches, np.zeros(len(poses), dtype=bool)
     spread = np.linspace(
         0,
         len(poses) - 1,
         _FOLLOWED,
-    ).astype(int)
-    some = np.unique([*spread, middle])
-    targets = np.tile(some, len(branches))
+    )
+    some = np.unique(spread.astype(int))
+    metres, radians = pose_distance(poses[:, None], poses[some])
+    distances = metres + _LEVER_M * radians
+    middle = some[distances.sum(0).argmin()]
+    branches = _postures(arm, poses[[middle] * _STARTS])
+    if not len(branches):
+        return branches, np.zeros(len(poses), dtype=bool)
     found = _iterate(
         arm,
-        poses[targets],
+        poses[np.tile(some, len(branches))],
         branches.repeat(len(some), 0),
     )
     values = found[0].reshape(
@@ -105,24 +99,22 @@ def _solved(arm: Arm, poses: SE3) -> tuple[Array, BoolArray]:
         -1,
     )
     reached = found[1].reshape(len(branches), -1)
-    apart = distances[np.ix_(some, some)] + np.diag(np.full(len(some), np.inf))
-    steps = _away(
+    motion = _away(
         arm,
         values,
-        values[:, apart.argmin(0)],
+        branches[:, None],
     ).mean(1)
-    from_rest = _away(
+    motion += _REST_WEIGHT * _away(
         arm,
-        values,
+        branches,
         arm.ranges.T[1],
-    ).mean(1)
-    best = np.lexsort([steps + _REST_WEIGHT * from_rest, -reached.sum(1)])[0]
-    solved = reached[best]
-    nearest = distances[:, some[solved]].argmin(1)
+    )
+    best = np.lexsort([motion, -reached.sum(1)])[0]
+    nearest = distances[:, reached[best]].argmin(1)
     return _iterate(
         arm,
         poses,
-        values[best][solved][nearest],
+        values[best][reached[best]][nearest],
     )
 
 
@@ -135,7 +127,6 @@ def _postures(arm: Arm, same: SE3) -> Array:
         upper,
         (_STARTS, len(arm.joints)),
     )
-    starts[0] = rest
     values, reached = _iterate(
         arm,
         same,
@@ -162,12 +153,11 @@ def _iterate(arm: Arm, poses: SE3, starts: Array) -> tuple[Array, BoolArray]:
         miss = (arm.poses(at).inverse() @ poses[active]).log() * _WEIGHTS
         slopes = arm.slopes(at) * _WEIGHTS[:, None]
         misses[active] = np.linalg.norm(miss, axis=1)
-        damping = 1e-9 + 1e-2 * misses[active, None, None] ** 2
         # Motions that leave the gripper where it is lead towards the usual posture.
         aside = 0.5 * _turned(arm, rest - at)
         miss -= (slopes @ aside[..., None])[..., 0]
         back = slopes.swapaxes(1, 2)
-        gram = slopes @ back + damping * np.eye(6)
+        gram = slopes @ back + _DAMPING * np.eye(6)
         steps = aside + (back @ np.linalg.solve(gram, miss[..., None]))[..., 0]
         longest = np.abs(steps).max(1)
         shorter = np.minimum(1, _LONGEST_STEP / longest.clip(1e-9))

@@ -74,7 +74,7 @@ def _usual(
     azimuth = middle + heading * np.angle(turn * np.exp(-1j * middle))
     zero = np.zeros_like(azimuth)
     ahead = np.stack([np.cos(azimuth), np.sin(azimuth), zero], 1)
-    side = np.cross([0, 0, 1], ahead)
+    side = np.cross(np.eye(3)[2], ahead)
     away = wrist - shoulder
     half = (
         np.linalg.norm(
@@ -87,11 +87,7 @@ def _usual(
     longest = np.linalg.norm(position - shoulder, axis=1).max()
     link_m = np.maximum(link * longest, 1.02 * half)
     up = _unit(np.cross(away, side))
-    up *= np.where(
-        up[:, 2:] < 0,
-        -1,
-        1,
-    )
+    up *= np.sign(up[:, 2:])
     elbow = shoulder + away / 2 + up * np.sqrt(link_m**2 - half**2)
     upper = _unit(elbow - shoulder)
     fore = _unit(wrist - elbow)

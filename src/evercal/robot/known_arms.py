@@ -2,7 +2,6 @@
 
 import json
 import re
-from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -13,77 +12,96 @@ from scipy.spatial.transform import Rotation
 from evercal.choices import ArmClass
 from evercal.errors import InputError
 from evercal.robot.arm import Arm, MovingJoint
+from evercal.robot.robot_model import RobotModel
+from evercal.typing import Array
 
 _FILE = Path(__file__).with_name("arms.json")
-"""Millimetres and degrees by the name of an arm.
+"""Metres and degrees by the name of an arm.
 
 `links` are Craig's Denavit-Hartenberg parameters a, alpha, d, theta up to each joint and up to the
-flange, `rest` is a usual posture.
+flange; `ranges` a lower limit, a usual value and an upper limit of each joint; `heights` those of
+the base frames that may be meant: on the floor, or where the first two axes meet.
 """
 _TOOLS_M = (0.0, 0.1, 0.2, 0.3)
 """Lengths of an unknown tool."""
 
-
-@cache
-def _arms() -> dict[str, Any]:
-    return json.loads(_FILE.read_text(encoding="utf-8"))
-
-
-ARM_NAMES: dict[str, ArmClass] = {name: arm["kind"] for name, arm in _arms().items()}
+_ARMS: dict[str, Any] = json.loads(_FILE.read_text(encoding="utf-8"))
+ARM_NAMES: dict[str, ArmClass] = {name: arm["kind"] for name, arm in _ARMS.items()}
 """The known arms, and the class of each."""
+USUAL_RAD: dict[ArmClass, float] = {
+    "industrial": 0.001,
+    "cobot": 0.0035,
+    "hobby": 0.02,
+}
+"""Usual standard deviation of joint offsets: 0.06, 0.2 and 1.1 deg."""
 
 
 def known_arm(name: str) -> Arm:
-    """The arm of a name, from its foot to its flange; upper case, spaces and - _ . are ignored."""
-    names = [known for known in ARM_NAMES if _plain(known) == _plain(name)]
-    if not names:
+    """The arm of a name, from its foot to its flange; upper case is the same."""
+    arm = _ARMS.get(name.lower())
+    if arm is None:
         raise InputError(
             f"arm {name!r} is not known; give a URDF, or one of {', '.join(ARM_NAMES)}"
         )
-    arm = _arms()[names[0]]
-    a, alpha, d, theta = np.array(arm["links"], dtype=float).T
+    a, alpha, d, theta = np.transpose(arm["links"])
     turns = Rotation.from_euler(
         "XZ",
         np.stack([alpha, theta], 1),
         degrees=True,
     )
-    tilt = np.radians(alpha)
     links = np.tile(np.eye(4), (len(a), 1, 1))
     links[:, :3, :3] = turns.as_matrix()
-    shifts = [a, -d * np.sin(tilt), d * np.cos(tilt)]
-    links[:, :3, 3] = np.stack(shifts, 1) / 1000
-    lower, upper = np.transpose(arm["limits"])
-    ranges = np.stack([lower, arm["rest"], upper], 1) * np.pi / 180
-    z = np.array([0, 0, 1.0])
-    chain = [
-        MovingJoint(
-            link,
-            z,
-            True,
-            i,
+    links[:, :3, 3] = links[:, :3, 2] * d[:, None]
+    links[:, 0, 3] += a
+    ranges = np.radians(arm["ranges"])
+    chain = []
+    for i, link in enumerate(links[:-1]):
+        rotates = i not in arm["sliding"]
+        chain.append(
+            MovingJoint(
+                link,
+                np.eye(3)[2],
+                rotates,
+                i,
+            )
         )
-        for i, link in enumerate(links[:-1])
-    ]
-    for sliding in arm.get("sliding", ()):
-        chain[sliding] = chain[sliding]._replace(rotates=False)
-        ranges[sliding] *= 0.18 / np.pi
-    joints = tuple(f"joint_{i + 1}" for i in range(len(chain)))
-    # Some controllers have their base frame where the first two axes meet.
-    heights = {0.0, arm.get("controller_mm", 0) / 1000}
-    assumed = tuple(product(heights, _TOOLS_M))
+        if not rotates:
+            ranges[i] = arm["ranges"][i]
+    joints = tuple(map(str, range(1, len(links))))
     return Arm(
         joints,
         tuple(chain),
         links[-1],
         ranges,
-        names[0],
-        assumed,
-    )
-
-
-def _plain(name: str) -> str:
-    return re.sub(
-        "[-_. ]",
-        "",
         name.lower(),
+        tuple(product(arm["heights"], _TOOLS_M)),
     )
+
+
+def arm_of(stated: str, base: str | None = None, gripper: str | None = None) -> Arm:
+    """The arm of a name, or of a URDF file between links; omitted, its root and its only end."""
+    if not stated.endswith((".urdf", ".xacro")):
+        return known_arm(stated)
+    model = RobotModel(stated)
+    return model.arm(*model.chosen_links(base, gripper))
+
+
+def offset_rad(stated: str | None, arm: Arm | None, slopes: Array) -> float:
+    """Standard deviation of joint offsets by an accuracy such as 0.2deg of the joints.
+
+    Or 1mm of the gripper, which `slopes` (n, 6, k) of the joints move; if omitted, that of the
+    class of the arm.
+    """
+    if stated is None:
+        kind = ARM_NAMES.get(arm.name if arm else "", "cobot")
+        return USUAL_RAD[kind]
+    number = re.fullmatch(r"(\d*\.?\d*[1-9]\d*) ?(deg|mm)", stated)
+    if number is None:
+        raise InputError(
+            f"`arm_accuracy` {stated!r}: give the standard deviation of the joints, such as 0.2deg,"
+            " or of the gripper, such as 1mm"
+        )
+    if number[2] == "deg":
+        return float(np.radians(float(number[1])))
+    lever_m = np.linalg.norm(slopes[:, :3]) / np.sqrt(len(slopes))
+    return float(number[1]) / 1000 / lever_m.item()
