@@ -138,7 +138,7 @@ def measure_sessions(name: str, count: int) -> Row:
             [lens_vector(fit.camera) for fit in fits if fit.camera], axis=0
         )[0]
         own = slice(12, 12 + len(change))
-        spread = sum(f.fit.factor * f.fit.covariance[own, own] for f in fits)
+        spread = sum(f.fit.covariance[own, own] for f in fits)
         lenses.append(change @ np.linalg.solve(spread, change))
     row: Row = {"condition": name, "trials": count, "refused": refused}
     row |= {"median_mm": median_of(mm), "p95_mm": float(np.quantile(mm, 0.95))}

@@ -156,7 +156,7 @@ def _frame_covariance(
     fit: HandEyeFit, similarity: Similarity, map_from_camera: SE3, size: int
 ) -> tuple[Array, tuple[float, float]]:
     """Covariance of the base frame as one motion of it, and sigmas in the middle of the cameras."""
-    whole = fit.factor * fit.covariance
+    whole = fit.covariance
     picked = np.r_[6:12, size]
     of_frame = whole[np.ix_(picked, picked)]
     rotation = similarity.base_from_map.rotation_matrix()

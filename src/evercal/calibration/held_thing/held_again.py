@@ -65,7 +65,7 @@ def held_again(
     except InputError:
         return None
     change = solution.fixed_from_board
-    covariance = solution.fit.factor * solution.fit.covariance[6:12, 6:12]
+    covariance = solution.fit.covariance[6:12, 6:12]
     tangent = np.r_[change.translation_m, change.log()[3:]]
     mm, deg = length_mm_deg(tangent)
     sigmas = np.sqrt(tangent @ np.linalg.solve(covariance, tangent))

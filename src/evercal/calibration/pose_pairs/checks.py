@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from evercal.calibration.pose_pairs.fit import (
-    KINDS,
     MIN_POSES,
     HandEyeFit,
     agreement,
+    predicted,
     refine,
     robust_fit,
 )
@@ -233,12 +233,10 @@ def held_out_error(
     lengths = []
     for fold in range(FOLDS):
         held_out = np.arange(len(rows)) % FOLDS == fold
-        at = _refined(
-            equation,
-            fit,
-            rows[~held_out],
-        )
-        residual = equation[rows[held_out]].system(at).residual.reshape(-1, 2, 3)
+        at = _refined(equation, fit, rows[~held_out])
+        parts = equation[np.concatenate([rows[~held_out], rows[held_out]])]
+        use = np.arange(len(rows)) < (~held_out).sum()
+        residual = predicted(parts, at, fit.levels, use).residual.reshape(-1, 2, 3)
         lengths.append(np.linalg.norm(residual, axis=2))
     error = np.concatenate(lengths) * (1000.0, 180 / np.pi)
     median_mm, median_deg = np.median(error, 0).tolist()
@@ -280,12 +278,12 @@ def _refined(
 ) -> Unknowns:
     use = np.zeros(len(equation), dtype=bool)
     use[rows] = True
-    return refine(equation, fit.at, fit.weights, use)
+    return refine(equation, fit.at, fit.levels, use)
 
 
 def left_open(fit: HandEyeFit, parent: str) -> list[str]:
     """Return what the poses determine badly, and which poses to add; one sentence each."""
-    position = fit.factor * fit.covariance[:3, :3]
+    position = fit.covariance[:3, :3]
     if 1000 * np.sqrt(float(np.trace(position)) / 3) < _SMALL_MM:
         return []
     sentences = []
@@ -315,11 +313,10 @@ def with_tested_size(
     """Free the size of the squares, or of a map, if the robot's motions contradict it."""
     # A wrong size looks like noise, so the noise is estimated again with the free size.
     free = replace(equation, extras=equation.extras.without_prior("size"))
-    freed = robust_fit(free, agreement(free, fit.at))
+    freed = robust_fit(free, agreement(free, fit.at), fit.levels)
     k = equation.extras.names.index("size")
     error = float(freed.at.extras[k])
     sigma = float(freed.sigma[12 + k])
-    sigma *= float(np.sqrt(1 + _alike(freed)))
     if abs(error) < max(_SIZE_SIGMAS * sigma, SIZE_SIGMA):
         return equation, fit, []
     # A camera in the point of rotation that sees a board of size zero fits, too.
@@ -354,27 +351,6 @@ def with_tested_size(
         f" estimated size"
     )
     return free, freed, [warning]
-
-
-def _alike(fit: HandEyeFit) -> float:
-    """Return by how much errors that are alike in similar poses enlarge the variance of the size.
-
-    Together as large as the noise, they move the size as much as all poses with independent noise.
-    """
-    noise = 0.0
-    for kind in KINDS:
-        if kind in fit.contributions:
-            noise = noise + np.trace(fit.contributions[kind][:3, :3])
-    return float(noise / np.trace(fit.covariance[:3, :3]) * fit.inliers.sum())
-
-
-def widened(equation: PoseEquation, fit: HandEyeFit) -> HandEyeFit:
-    """Add what errors of an arm that are alike in similar poses do through an unknown size."""
-    k = 12 + equation.extras.names.index("size")
-    # Divided before the product, which overflows where the size is open.
-    column = fit.covariance[:, k] / np.sqrt(max(fit.covariance[k, k], 1e-300))
-    added = _alike(fit) * np.outer(column, column)
-    return replace(fit, covariance=fit.covariance + added)
 
 
 def _misfit(fit: HandEyeFit) -> float:

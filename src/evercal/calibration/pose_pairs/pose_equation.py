@@ -8,13 +8,15 @@ every camera pose: intrinsics, the size of a square, a depth error that all imag
 Residuals are (translation, rotation vector) in the frame `fixed`, metres and radians.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3, cross_matrix
+from evercal.robot.pose_errors import SharedErrors
 from evercal.typing import Array, BoolArray, IntArray
 
 
@@ -123,6 +125,8 @@ class System:
     """(n, 6, 6) known covariance."""
     directions: dict[str, Array]
     """(n, 6, c) residuals due to unit errors of each kind of noise, by kind."""
+    shared: dict[str, SharedErrors]
+    """Residuals due to unit effects of each kind of errors that poses share, by kind."""
     prior: Array
     """(12 + q, 12 + q) information of the prior on the unknowns."""
     change: Array
@@ -149,6 +153,8 @@ class PoseEquation:
     velocity: Array | None = None
     """(n, 6) velocity of the parent in the frame `fixed`, for the last extra `clock`: the time to
     add to a camera stamp."""
+    shared: Mapping[str, SharedErrors] = field(default_factory=dict)
+    """Kinds of errors of gripper poses that they share, by name."""
 
     def __getitem__(self, index: IntArray | BoolArray) -> Self:
         changed: dict[str, Any] = {}
@@ -156,7 +162,8 @@ class PoseEquation:
             if isinstance(value, np.ndarray):
                 changed[name] = value[index]
         extras = replace(self.extras, slopes=self.extras.slopes[index])
-        return replace(self, extras=extras, **changed)
+        shared = {name: kind[index] for name, kind in self.shared.items()}
+        return replace(self, extras=extras, shared=shared, **changed)
 
     def __len__(self) -> int:
         return len(self.robot_translation)
@@ -203,9 +210,26 @@ class PoseEquation:
             jacobian=jacobian,
             known=by_camera @ self.camera_covariance @ by_camera.transpose(0, 2, 1),
             directions=self._noise_directions(at),
+            shared=self._shared(at),
             prior=np.pad(self.extras.information, (12, 0)),
             change=np.r_[np.zeros(12), at.extras - self.extras.mean],
         )
+
+    def _shared(self, at: Unknowns) -> dict[str, SharedErrors]:
+        """Residuals due to unit effects; a fixed camera sees the gripper move the other way."""
+        lever = np.broadcast_to(at.translations[1], (len(self), 3))
+        axes = -np.broadcast_to(np.eye(3), (len(self), 3, 3))
+        if self.base_is_fixed:
+            lever = lever - self.robot_translation
+            axes = self.robot_rotation
+        by_gripper = np.zeros((len(self), 6, 6))
+        by_gripper[:, :3, :3] = axes
+        by_gripper[:, 3:, 3:] = axes
+        by_gripper[:, :3, 3:] = -cross_matrix(lever) @ axes
+        moved = {}
+        for name, kind in self.shared.items():
+            moved[name] = kind._replace(slopes=by_gripper @ kind.slopes)
+        return moved
 
     def _noise_directions(
         self,

@@ -11,7 +11,8 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import f
 
-from evercal.calibration.pose_pairs.fit import HandEyeFit, clipped_inverse
+from evercal.calibration.pose_pairs.fit import HandEyeFit
+from evercal.calibration.pose_pairs.noise_levels import Noise, clipped_inverse
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
 from evercal.typing import Array, BoolArray, IntArray
 
@@ -125,11 +126,12 @@ def _steps(
     noise, over the root mean square of the positions.
     """
     system = equation[order].system(fit.at)
-    whiten = np.linalg.inv(np.linalg.cholesky(fit.weights[order]))
+    covariance = Noise(system, fit.levels).independent
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     residual = (whiten @ system.residual[..., None])[..., 0]
     place = equation.robot_translation[order] - equation.robot_translation.mean(0)
     place /= max(float(np.sqrt((place**2).sum(1).mean())), 1e-9)
-    noise = whiten @ np.linalg.cholesky(fit.weights.mean(0))
+    noise = whiten @ np.linalg.cholesky(covariance.mean(0))
     by_place = [noise * place[:, k, None, None] for k in range(3)]
     jacobian = np.concatenate([whiten @ system.jacobian, *by_place], 2)
     used = jacobian.transpose(0, 2, 1) * use[:, None, None]

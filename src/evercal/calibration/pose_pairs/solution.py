@@ -102,7 +102,7 @@ class PairSolution:
 
     def calibration(self, time_offset_s: float | None = None) -> Calibration:
         """Return the calibration, with another time offset than that of the fit if given."""
-        covariance = self.fit.factor * self.fit.covariance[:6, :6]
+        covariance = self.fit.covariance[:6, :6]
         calibration = Calibration(
             mount=self.mount,
             parent_from_child=self.fit.at.parent_from_camera,
@@ -197,6 +197,6 @@ class PairSolution:
             part = fit.contributions.get(name, np.zeros((6, 6)))
             if np.trace(part) > least:
                 terms.append(ErrorTerm.of(cause, part))
-        rest = fit.factor * fit.covariance[:6, :6] - sum(fit.contributions.values())
+        rest = fit.covariance[:6, :6] - sum(fit.contributions.values())
         rest_name = "few poses, and errors alike in similar poses"
         return (*terms, ErrorTerm.of(rest_name, rest))

@@ -14,7 +14,6 @@ from evercal.calibration.pose_pairs.checks import (
     require_observable,
     require_rotations,
     require_two_lists,
-    widened,
     with_tested_size,
 )
 from evercal.calibration.pose_pairs.corner_warnings import corner_warnings
@@ -40,8 +39,11 @@ from evercal.calibration.pose_pairs.starts import quick_fit
 from evercal.errors import InputError
 from evercal.geometry import SE3, cross_matrix, pose_distance
 from evercal.robot.mount import MountName, mount_named
+from evercal.robot.pose_errors import ArmErrors, shared_errors
 from evercal.typing import BoolArray, IntArray
 
+_USUAL = ArmErrors()
+"""An arm of which nothing is known."""
 _REACH_M = 0.4
 """Distance from the gripper of what it carries above which the mount may be the other one."""
 _OTHER_MOUNT = 4.0
@@ -59,6 +61,7 @@ def solve(
     mount: MountName,
     scale_known: bool = True,
     corners: BoardCorners | None = None,
+    errors: ArmErrors = _USUAL,
 ) -> Calibration:
     """Calibrate a camera on the gripper or beside the robot from pose pairs.
 
@@ -78,11 +81,13 @@ def solve(
         scale_known: Whether the camera's translations are in metres; otherwise their scale is
             estimated.
         corners: Corners of the board in the order of `pairs`.
+        errors: What is known of the arm.
 
     Returns:
         `gripper_from_camera` or `base_from_camera`.
     """
-    return solve_pose_pairs(pairs, mount, scale_known, corners).calibration()
+    solution = solve_pose_pairs(pairs, mount, scale_known, corners, errors=errors)
+    return solution.calibration()
 
 
 def solve_pose_pairs(
@@ -91,6 +96,7 @@ def solve_pose_pairs(
     scale_known: bool = True,
     corners: BoardCorners | None = None,
     of_board: bool = True,
+    errors: ArmErrors = _USUAL,
 ) -> PairSolution:
     """Like `solve`, but return the fit. Poses in a map, not `of_board`, may have any direction."""
     mount_named(mount)
@@ -108,12 +114,14 @@ def solve_pose_pairs(
         pairs, corners, lens, start, scale = refined
     problem = _Problem(mount, scale, scale_known, corners, of_board)
     equation, fit, lens = problem.fitted(pairs, rows, start.at, lens)
+    slip = find_slip(equation, fit, rows)
+    kinds = shared_errors(pairs.base_from_gripper, errors)
+    shared = {name: kind[rows] for name, kind in kinds.items()}
+    equation = replace(equation, shared=shared)
+    fit = robust_fit(equation, agreement(equation, fit.at))
     warnings: list[str] = []
     if scale_known:
         equation, fit, warnings = with_tested_size(equation, fit, corners, of_board)
-    else:
-        fit = widened(equation, fit)
-    slip = find_slip(equation, fit, rows)
     if slip is not None:
         fit = replace(fit, covariance=fit.covariance + slip.spread)
         warnings.append(_slip_warning(slip, pairs.names, of_board))

@@ -1,0 +1,211 @@
+"""Noise of the hand-eye equation, and the sizes of its kinds by restricted maximum likelihood.
+
+Residuals are smaller than the noise, because the fit follows part of it: H. Patterson and
+R. Thompson, Recovery of inter-block information, 1971. Errors that poses share make the covariance
+of the residuals dense. It is the sum of a block of each pose and a matrix of low rank, and is
+inverted as such (M. Woodbury, Inverting modified matrices, 1950).
+"""
+
+import numpy as np
+from scipy.linalg import lapack, solve_triangular
+from scipy.optimize import minimize
+from scipy.stats import norm
+
+from evercal.calibration.pose_pairs.pose_equation import System
+from evercal.typing import Array
+
+FLOOR = np.diag([1e-14] * 6)
+"""Minimum variance of a pose, metres^2 and radians^2, so that exact poses have finite weight."""
+_SMALLEST = -16.0
+"""Smallest logarithm of a variance, from that of its start."""
+_LARGEST = 9.0
+"""Largest one."""
+_FIRST_SHARED = 0.3
+"""First variance of a kind that poses share, in variances of the residuals."""
+_PRECISION = 1e-7
+"""Relative change of the likelihood that ends its maximization."""
+_AT_ZERO = 0.6
+"""Mean of a variance whose likelihood falls from zero on like that of a normal variable, by the
+mean of the positive half of that variable; the standard deviation has a flat prior."""
+_NOTHING_SEEN = 2 * (_AT_ZERO * np.sqrt(2 / np.pi)) ** 2
+"""Information on a variance without any residual, by which its mean is that of the prior."""
+
+
+class Noise:
+    """Covariance of the residuals (n, 6) of a system, by the variances of its kinds."""
+
+    def __init__(self, system: System, variance: Array) -> None:
+        n = len(system.residual)
+        count = len(system.directions)
+        own = np.tensordot(variance[:count], _spreads(system), 1)
+        self.independent = system.known + FLOOR + own
+        """(n, 6, 6) of errors that no other pose shares."""
+        parts = [np.zeros((n, 6, 0))]
+        sizes = np.sqrt(variance[count:])
+        for size, kind in zip(sizes, system.shared.values(), strict=True):
+            parts.append(size * kind.slopes)
+        self.shared = np.concatenate(parts, 2)
+        """(n, 6, r) residuals by the effects of all kinds that poses share; their covariance is
+        the identity before the residuals are known."""
+        self._information = np.linalg.inv(self.independent)
+        rank = self.shared.shape[2]
+        weighted = (self._information @ self.shared).reshape(6 * n, rank)
+        inner = self.shared.reshape(6 * n, rank).T @ weighted
+        inner.flat[:: rank + 1] += 1.0
+        self._root = np.linalg.cholesky(inner)
+        half = solve_triangular(self._root, weighted.T, lower=True, check_finite=False)
+        self._half = half.T
+
+    def weighted(self, values: Array) -> Array:
+        """Multiply (n, 6, m) by the inverse covariance."""
+        m = values.shape[2]
+        own = self._information @ values
+        shared = self._half @ (self._half.T @ values.reshape(-1, m))
+        return own - shared.reshape(own.shape)
+
+    def blocks(self) -> Array:
+        """(n, 6, 6) blocks of the inverse covariance."""
+        half = self._half.reshape(len(self.independent), 6, -1)
+        return self._information - half @ half.transpose(0, 2, 1)
+
+    def unexplained(self) -> Array:
+        """(r, r) covariance of the effects, if all other unknowns were known."""
+        rank = len(self._root)
+        if not rank:
+            return np.zeros((0, 0))
+        inverse, _ = lapack.dpotri(self._root, lower=1)
+        return np.tril(inverse) + np.tril(inverse, -1).T
+
+    def logarithm(self) -> float:
+        """Logarithm of the determinant of the covariance."""
+        own = np.linalg.slogdet(self.independent)[1].sum()
+        return float(own + 2 * np.log(np.diag(self._root)).sum())
+
+
+def clipped_inverse(normal: Array) -> Array:
+    """Invert (p, p) normal equations; an unconstrained unknown gets a huge variance."""
+    factor, _ = _factor(normal)
+    return factor @ factor.T
+
+
+def normal_matrix(system: System, weighted: Array) -> Array:
+    """(p, p) normal equations of a system, by its weighted Jacobian (n, 6, p)."""
+    p = weighted.shape[2]
+    return weighted.reshape(-1, p).T @ system.jacobian.reshape(-1, p) + system.prior
+
+
+def slope_of(system: System, weighted: Array) -> Array:
+    """(p,) half of the slope of the sum of squares."""
+    from_prior = system.prior @ system.change
+    return np.einsum("nip,ni->p", weighted, system.residual) + from_prior
+
+
+def estimate_levels(system: System, start: Array | None = None) -> Array:
+    """Variance (k,) of each kind of noise, metres^2 or radians^2; `start` is that of a similar fit.
+
+    The kinds are those of `System.directions`, then of `System.shared`.
+    """
+    first = _first_levels(system)
+    at = first
+    if start is not None:
+        at = np.clip(start, 1e-5 * first, 1e3 * first)
+    bounds = [(value + _SMALLEST, value + _LARGEST) for value in np.log(first)]
+    found = minimize(
+        _likelihood,
+        np.log(at),
+        args=(system,),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"ftol": _PRECISION},
+    )
+    return np.exp(found.x)
+
+
+def mean_levels(system: System, variance: Array) -> Array:
+    """Mean of each variance (k,), given that where its likelihood is largest.
+
+    They differ where the likelihood is largest near zero: what the residuals do not exclude.
+    """
+    noise = Noise(system, variance)
+    weighted = noise.weighted(system.jacobian)
+    factor, _ = _factor(normal_matrix(system, weighted))
+    explained = weighted @ factor
+    own = noise.blocks() - explained @ explained.transpose(0, 2, 1)
+    information = []
+    for spread in system.directions.values():
+        # What poses share is left out: a direction of one pose hardly looks like that of another.
+        seen = spread.transpose(0, 2, 1) @ own @ spread
+        information.append((seen**2).sum())
+    rows = 6 * len(system.residual)
+    for kind in system.shared.values():
+        slopes = kind.slopes.reshape(rows, -1)
+        seen = slopes.T @ noise.weighted(kind.slopes).reshape(rows, -1)
+        by_fit = slopes.T @ explained.reshape(rows, -1)
+        squares = ((seen - by_fit @ by_fit.T) ** 2).sum()
+        information.append(squares + _NOTHING_SEEN / kind.usual**4)
+    sigma = np.sqrt(2 / np.maximum(information, 1e-300))
+    ratio = np.minimum(variance / sigma, 30.0)
+    return variance + _AT_ZERO * sigma * norm.pdf(ratio) / norm.cdf(ratio)
+
+
+def _likelihood(logarithms: Array, system: System) -> tuple[float, Array]:
+    """Twice the negative logarithm of the restricted likelihood, and its slope."""
+    variance = np.exp(logarithms)
+    noise = Noise(system, variance)
+    weighted = noise.weighted(system.jacobian)
+    factor, determinant = _factor(normal_matrix(system, weighted))
+    step = -factor @ (factor.T @ slope_of(system, weighted))
+    error = system.residual + system.jacobian @ step
+    pull = noise.weighted(error[..., None])[..., 0]
+    squares = (pull * system.residual).sum()
+    squares += system.change @ system.prior @ (system.change + step)
+    value = noise.logarithm() + determinant + squares
+    half = weighted @ factor
+    own = noise.blocks() - half @ half.transpose(0, 2, 1)
+    slope = []
+    count = len(system.directions)
+    for size, spread in zip(variance[:count], system.directions.values(), strict=True):
+        expected = (spread * (own @ spread)).sum()
+        observed = ((spread.transpose(0, 2, 1) @ pull[..., None]) ** 2).sum()
+        slope.append(size * (expected - observed))
+    rows = pull.size
+    effects = noise.shared.reshape(rows, noise.shared.shape[2]).T
+    observed = (effects @ pull.ravel()) ** 2
+    explained = ((effects @ half.reshape(rows, -1)) ** 2).sum(1)
+    expected = 1 - np.diag(noise.unexplained()) - explained
+    first = 0
+    for size, kind in zip(variance[count:], system.shared.values(), strict=True):
+        last = first + kind.slopes.shape[2]
+        usual = size / kind.usual**2
+        value += usual
+        slope.append((expected - observed)[first:last].sum() + usual)
+        first = last
+    return float(value), np.array(slope)
+
+
+def _factor(normal: Array) -> tuple[Array, float]:
+    """Factor F of the inverse F F^T of (p, p) normal equations; logarithm of their determinant."""
+    unit = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-200))
+    values, axes = np.linalg.eigh(normal * np.outer(unit, unit))
+    values = np.maximum(values, 1e-14)
+    determinant = np.log(values).sum() - 2 * np.log(unit).sum()
+    return unit[:, None] * axes / np.sqrt(values), float(determinant)
+
+
+def _first_levels(system: System) -> Array:
+    metres2 = np.mean(system.residual[:, :3] ** 2)
+    radians2 = np.mean(system.residual[:, 3:] ** 2)
+    levels = []
+    for kind in system.directions:
+        own = radians2 if kind.startswith("rotation") else metres2
+        levels.append(2 / len(system.directions) * own)
+    for kind in system.shared:
+        own = metres2 if kind.endswith("translation") else radians2
+        levels.append(_FIRST_SHARED * own)
+    return np.array(levels) + 1e-18
+
+
+def _spreads(system: System) -> Array:
+    directions = system.directions.values()
+    return np.stack([part @ part.transpose(0, 2, 1) for part in directions])

@@ -1,0 +1,91 @@
+"""Errors that stated gripper poses share, as kinds with a Gaussian prior.
+
+Poses of an arm do not err independently: offsets of its joints, bent links and a base that gives
+way move neighbouring poses alike, and heat moves those of one time alike. An error of a kind is the
+sum of unit effects, each multiplied by a normal variable with the size of the kind. So a kind is a
+covariance of rank r over all poses. Its size is estimated from the recording, see
+`evercal.calibration.pose_pairs.noise_levels`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from evercal.geometry import SE3, pose_distance
+from evercal.robot.arm import Arm
+from evercal.robot.joint_slopes import joint_slopes
+from evercal.typing import Array, IntArray
+
+USUAL_ACCURACY_RAD = np.deg2rad(0.2)
+"""Size of joint offsets of an arm of which nothing is known, one standard deviation."""
+_USUAL_REACH_M = 0.5
+"""Lever on which such a rotation moves a gripper."""
+_SMOOTH_M = 1.0
+"""Distance over which smooth errors change: a workspace."""
+_SMOOTH_RAD = 2.0
+"""Rotation over which they change: the range of a joint."""
+_DRIFT_SAMPLES = 4.0
+"""Number of poses over which drift changes."""
+_MOST_PLACES = 60
+"""Number of poses that smooth errors are interpolated between, and drift."""
+_LEAST_SHARE = 1e-3
+"""Effects with a smaller share of the variance of the largest are left out."""
+
+
+class SharedErrors(NamedTuple):
+    """One kind of errors that n poses share."""
+
+    slopes: Array
+    """(n, 6, r) errors of the poses by unit effects: translation and rotation in the axes of the
+    gripper; metres and radians."""
+    usual: float
+    """Prior standard deviation of the size, metres or radians."""
+
+    def __getitem__(self, rows: IntArray) -> "SharedErrors":
+        return self._replace(slopes=self.slopes[rows])
+
+
+class ArmErrors(NamedTuple):
+    """What is known of an arm whose poses are stated."""
+
+    arm: Arm | None = None
+    """Its kinematics; without it, those of usual arms."""
+    accuracy_rad: float = USUAL_ACCURACY_RAD
+    """Prior standard deviation of an offset of a joint."""
+
+
+def shared_errors(base_from_gripper: SE3, errors: ArmErrors) -> dict[str, SharedErrors]:
+    """Kinds of errors of gripper poses (n,) in the order of time, by name."""
+    accuracy_rad = errors.accuracy_rad
+    joints = joint_slopes(base_from_gripper, errors.arm)
+    n = len(base_from_gripper)
+    metres, radians = pose_distance(base_from_gripper[:, None], base_from_gripper)
+    apart = np.sqrt(3 * (metres / _SMOOTH_M) ** 2 + 3 * (radians / _SMOOTH_RAD) ** 2)
+    # Matern covariance of order 3/2: smooth, with details of all sizes.
+    smooth = (1 + apart) * np.exp(-apart)
+    samples = max(_DRIFT_SAMPLES, 2 * n / _MOST_PLACES)
+    steps = np.subtract.outer(np.arange(n), np.arange(n)) / samples
+    drift = np.exp(-0.5 * steps**2)
+    kinds = {"joint offsets": SharedErrors(joints, accuracy_rad)}
+    for name, correlation in (("smooth", smooth), ("drift", drift)):
+        effects = _effects(correlation)
+        shift, turn = np.zeros((2, n, 6, 3, effects.shape[1]))
+        for axis in range(3):
+            shift[:, axis, axis] = effects
+            turn[:, 3 + axis, axis] = effects
+        moved_m = accuracy_rad * _USUAL_REACH_M
+        kinds[f"{name} translation"] = SharedErrors(shift.reshape(n, 6, -1), moved_m)
+        kinds[f"{name} rotation"] = SharedErrors(turn.reshape(n, 6, -1), accuracy_rad)
+    return kinds
+
+
+def _effects(correlation: Array) -> Array:
+    """(n, r) factor of a correlation matrix (n, n), by Nystroem's approximation.
+
+    C. Williams and M. Seeger, Using the Nystroem method to speed up kernel machines, 2000.
+    """
+    n = len(correlation)
+    places = np.linspace(0, n - 1, min(n, _MOST_PLACES)).round().astype(int)
+    values, axes = np.linalg.eigh(correlation[np.ix_(places, places)])
+    large = values > _LEAST_SHARE * values[-1]
+    return correlation[:, places] @ (axes[:, large] / np.sqrt(values[large]))
