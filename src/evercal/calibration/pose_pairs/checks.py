@@ -311,10 +311,15 @@ def with_tested_size(
     of_board: bool = True,
 ) -> tuple[PoseEquation, HandEyeFit, list[str]]:
     """Free the size of the squares, or of a map, if the robot's motions contradict it."""
+    k = equation.extras.names.index("size")
+    # What the residuals say without the prior.
+    information = fit.sigma[12 + k] ** -2.0 - SIZE_SIGMA**-2.0
+    pull = fit.at.extras[k] / fit.sigma[12 + k] ** 2
+    if pull**2 < information:
+        return equation, fit, []
     # A wrong size looks like noise, so the noise is estimated again with the free size.
     free = replace(equation, extras=equation.extras.without_prior("size"))
     freed = robust_fit(free, agreement(free, fit.at), fit.levels)
-    k = equation.extras.names.index("size")
     error = float(freed.at.extras[k])
     sigma = float(freed.sigma[12 + k])
     if abs(error) < max(_SIZE_SIGMAS * sigma, SIZE_SIGMA):

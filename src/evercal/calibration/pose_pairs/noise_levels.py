@@ -22,9 +22,9 @@ _LARGEST = 9.0
 """Largest one."""
 _FIRST_SHARED = 0.3
 """First variance of a kind that poses share, in variances of the residuals."""
-_PRECISION = 1e-7
+_PRECISION = 1e-5
 """Relative change of the likelihood that ends its maximization."""
-_AT_ZERO = 0.6
+_AT_ZERO = 0.3
 """Mean of a variance whose likelihood falls from zero on like that of a normal variable, by the
 mean of the positive half of that variable; the standard deviation has a flat prior."""
 _NOTHING_SEEN = 2 * (_AT_ZERO * np.sqrt(2 / np.pi)) ** 2
