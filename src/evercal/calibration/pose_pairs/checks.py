@@ -67,7 +67,7 @@ _REMEDIES = {
 """Causes of uncertainty by group of extras, and what removes them."""
 SIZE_SIGMA = 0.002
 """Relative standard deviation of a stated square size, and of a depth error of all images."""
-_SIZE_SIGMAS = 3.0
+_SIZE_SIGMAS = 5.0
 """Significance of a wrong size, standard deviations."""
 _LARGE_SIZE = 0.1
 """Relative error of a size that is believed only if the residuals fall by `_MUCH_BETTER`."""

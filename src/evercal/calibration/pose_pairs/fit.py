@@ -27,6 +27,8 @@ _REJECTION = 0.001
 """Probability of rejecting any pose of a recording without outliers."""
 _LEAST_USED = 2 / 3
 """Share of the poses that is used at least."""
+_MOST_JUDGES = 100
+"""Maximum number of poses that estimate the noise levels."""
 _MAX_ROUNDS = 12
 """Maximum number of rounds of refinement, noise estimation and rejection."""
 _MAX_STEPS = 30
@@ -122,8 +124,7 @@ def robust_fit(
     if inliers.sum() < least:
         inliers = np.ones(n, dtype=bool)
     for _ in range(_MAX_ROUNDS):
-        used = equation[inliers].system(at)
-        levels = estimate_levels(used, levels)
+        levels = estimate_levels(_judges(equation, inliers).system(at), levels)
         at = refine(equation, at, levels, inliers)
         distance2 = _distances(equation, at, levels, inliers)
         freedom = max(6 * int(inliers.sum()) - equation.unknowns, 2)
@@ -133,9 +134,16 @@ def robust_fit(
             break
         inliers = selected
     assert levels is not None
-    levels = mean_levels(equation[inliers].system(at), levels)
+    levels = mean_levels(_judges(equation, inliers).system(at), levels)
     at = refine(equation, at, levels, inliers)
     return _result(equation, at, inliers, levels)
+
+
+def _judges(equation: PoseEquation, use: BoolArray) -> PoseEquation:
+    """The used poses that estimate the noise: more of them cost much and tell little."""
+    rows = np.flatnonzero(use)
+    count = min(len(rows), _MOST_JUDGES)
+    return equation[rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]]
 
 
 def refine(

@@ -7,11 +7,12 @@ inverted as such (M. Woodbury, Inverting modified matrices, 1950).
 """
 
 import numpy as np
-from scipy.linalg import lapack, solve_triangular
+from scipy.linalg import block_diag, lapack, solve_triangular
 from scipy.optimize import minimize
 from scipy.stats import norm
 
 from evercal.calibration.pose_pairs.pose_equation import System
+from evercal.geometry.normal_equations import normal_inverse
 from evercal.typing import Array
 
 FLOOR = np.diag([1e-14] * 6)
@@ -24,9 +25,11 @@ _FIRST_SHARED = 0.3
 """First variance of a kind that poses share, in variances of the residuals."""
 _PRECISION = 1e-5
 """Relative change of the likelihood that ends its maximization."""
-_AT_ZERO = 0.3
+_AT_ZERO = 0.2
 """Mean of a variance whose likelihood falls from zero on like that of a normal variable, by the
 mean of the positive half of that variable; the standard deviation has a flat prior."""
+_RIDGE = 1e-9
+"""Share by which kinds of noise differ at least."""
 _NOTHING_SEEN = 2 * (_AT_ZERO * np.sqrt(2 / np.pi)) ** 2
 """Information on a variance without any residual, by which its mean is that of the prior."""
 
@@ -60,7 +63,7 @@ class Noise:
         """Multiply (n, 6, m) by the inverse covariance."""
         m = values.shape[2]
         own = self._information @ values
-        shared = self._half @ (self._half.T @ values.reshape(-1, m))
+        shared = self._half @ (self._half.T @ values.reshape(len(self._half), m))
         return own - shared.reshape(own.shape)
 
     def blocks(self) -> Array:
@@ -127,26 +130,32 @@ def mean_levels(system: System, variance: Array) -> Array:
 
     They differ where the likelihood is largest near zero: what the residuals do not exclude.
     """
+    information = _information(system, variance)
+    count = len(system.directions)
+    for k, kind in enumerate(system.shared.values(), count):
+        information[k, k] += _NOTHING_SEEN / kind.usual**4
+    sigma = np.sqrt(2 * np.diag(normal_inverse(information, _RIDGE)))
+    ratio = np.minimum(variance / sigma, 30.0)
+    return variance + _AT_ZERO * sigma * norm.pdf(ratio) / norm.cdf(ratio)
+
+
+def _information(system: System, variance: Array) -> Array:
+    """(k, k) twice the expected information of the residuals on the variances."""
     noise = Noise(system, variance)
     weighted = noise.weighted(system.jacobian)
     factor, _ = _factor(normal_matrix(system, weighted))
-    explained = weighted @ factor
-    own = noise.blocks() - explained @ explained.transpose(0, 2, 1)
-    information = []
-    for spread in system.directions.values():
-        # What poses share is left out: a direction of one pose hardly looks like that of another.
-        seen = spread.transpose(0, 2, 1) @ own @ spread
-        information.append((seen**2).sum())
-    rows = 6 * len(system.residual)
+    rows = system.residual.size
+    kinds = [block_diag(*directions) for directions in system.directions.values()]
     for kind in system.shared.values():
-        slopes = kind.slopes.reshape(rows, -1)
-        seen = slopes.T @ noise.weighted(kind.slopes).reshape(rows, -1)
-        by_fit = slopes.T @ explained.reshape(rows, -1)
-        squares = ((seen - by_fit @ by_fit.T) ** 2).sum()
-        information.append(squares + _NOTHING_SEEN / kind.usual**4)
-    sigma = np.sqrt(2 / np.maximum(information, 1e-300))
-    ratio = np.minimum(variance / sigma, 30.0)
-    return variance + _AT_ZERO * sigma * norm.pdf(ratio) / norm.cdf(ratio)
+        kinds.append(kind.slopes.reshape(rows, -1))
+    effects = np.concatenate(kinds, 1)
+    weighted_effects = noise.weighted(effects.reshape(*system.residual.shape, -1))
+    by_fit = factor.T @ (weighted.reshape(rows, -1).T @ effects)
+    between = effects.T @ weighted_effects.reshape(rows, -1) - by_fit.T @ by_fit
+    # Which effects are of which kind.
+    ranks = [kind.shape[1] for kind in kinds]
+    member = np.eye(len(kinds))[np.repeat(np.arange(len(kinds)), ranks)]
+    return member.T @ between**2 @ member
 
 
 def _likelihood(logarithms: Array, system: System) -> tuple[float, Array]:
