@@ -1,6 +1,6 @@
 """Robust joint estimate of all unknowns of the hand-eye equation, and its covariance."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +10,9 @@ from evercal.calibration.pose_pairs.noise_levels import (
     FLOOR,
     Noise,
     clipped_inverse,
+    ellipsoid_factor,
     estimate_levels,
+    level_uncertainty,
     mean_levels,
     normal_matrix,
     slope_of,
@@ -25,8 +27,8 @@ _GROSS = 40.0
 """Squared distance of gross outliers, which the first noise estimate ignores."""
 _REJECTION = 0.001
 """Probability of rejecting any pose of a recording without outliers."""
-_LEAST_USED = 2 / 3
-"""Share of the poses that is used at least."""
+_FEW = 8
+"""Of poses fewer than this, and by half more, two thirds are used at least, of more a half."""
 _MOST_JUDGES = 100
 """Maximum number of poses that estimate the noise levels."""
 _MAX_ROUNDS = 12
@@ -119,8 +121,8 @@ def robust_fit(
     n = len(equation)
     at = start.at
     inliers = start.inliers
+    least = max(MIN_POSES, n // 2, min(_FEW, int(np.ceil(2 * n / 3))))
     # Outliers cannot be detected; all poses widen the covariance.
-    least = max(MIN_POSES, int(np.ceil(_LEAST_USED * n)))
     if inliers.sum() < least:
         inliers = np.ones(n, dtype=bool)
     for _ in range(_MAX_ROUNDS):
@@ -134,9 +136,21 @@ def robust_fit(
             break
         inliers = selected
     assert levels is not None
-    levels = mean_levels(_judges(equation, inliers).system(at), levels)
+    judges = _judges(equation, inliers).system(at)
+    if equation.shared:
+        levels = mean_levels(judges, levels)
     at = refine(equation, at, levels, inliers)
-    return _result(equation, at, inliers, levels)
+    fit = _result(equation, at, inliers, levels)
+    if equation.shared:
+        return fit
+    slopes = [
+        fit.contributions[kind] / level
+        for kind, level in zip(judges.directions, levels, strict=True)
+    ]
+    factor = ellipsoid_factor(
+        fit.covariance[:6, :6], np.stack(slopes), level_uncertainty(judges, levels)
+    )
+    return replace(fit, covariance=factor * fit.covariance)
 
 
 def _judges(equation: PoseEquation, use: BoolArray) -> PoseEquation:

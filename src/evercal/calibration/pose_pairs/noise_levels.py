@@ -6,10 +6,12 @@ of the residuals dense. It is the sum of a block of each pose and a matrix of lo
 inverted as such (M. Woodbury, Inverting modified matrices, 1950).
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.linalg import block_diag, lapack, solve_triangular
 from scipy.optimize import minimize
-from scipy.stats import norm
+from scipy.stats import chi2, f, norm
 
 from evercal.calibration.pose_pairs.pose_equation import System
 from evercal.geometry.normal_equations import normal_inverse
@@ -25,9 +27,17 @@ _FIRST_SHARED = 0.3
 """First variance of a kind that poses share, in variances of the residuals."""
 _PRECISION = 1e-5
 """Relative change of the likelihood that ends its maximization."""
-_AT_ZERO = 0.2
+
+_PSEUDO = 1.0
+"""Number of pseudo-residuals of each independent kind, as large as all residuals together: without
+them, few poses have a likelihood that is largest where one kind is zero and fits exactly."""
+_AT_ZERO = 0.3
 """Mean of a variance whose likelihood falls from zero on like that of a normal variable, by the
 mean of the positive half of that variable; the standard deviation has a flat prior."""
+_COVERAGE = 0.95
+"""Coverage of the ellipsoids that `ellipsoid_factor` widens."""
+_LEAST_LEFT = 0.5
+"""Share of a variance that is left at least."""
 _RIDGE = 1e-9
 """Share by which kinds of noise differ at least."""
 _NOTHING_SEEN = 2 * (_AT_ZERO * np.sqrt(2 / np.pi)) ** 2
@@ -125,22 +135,53 @@ def estimate_levels(system: System, start: Array | None = None) -> Array:
     return np.exp(found.x)
 
 
+def evidence_of_shared(system: System) -> float:
+    """Logarithm of the likelihood ratio of a system and the same without errors that are shared."""
+    alone = replace(system, shared={})
+    least = []
+    for one in (alone, system):
+        logarithms = np.log(estimate_levels(one))
+        least.append(_likelihood(logarithms, one)[0])
+    return (least[0] - least[1]) / 2
+
+
+def ellipsoid_factor(
+    covariance: Array,
+    slopes: Array,
+    uncertainty: Array,
+) -> float:
+    """Return the factor on a covariance (d, d) for its chi-square quantile of 95 % to cover 95 %.
+
+    Squared distances by an estimated covariance follow an F distribution. A variance with nu
+    degrees of freedom has a relative variance of 2 / nu (F. Satterthwaite, An approximate
+    distribution of estimates of variance components, 1946); the axis with the fewest decides.
+    `slopes` (k, d, d) are the derivatives of the covariance by the variances of the noise.
+    """
+    d = len(covariance)
+    values, axes = np.linalg.eigh(covariance)
+    whiten = axes / np.sqrt(np.maximum(values, 1e-300))
+    gradient = np.einsum("dm,kde,em->mk", whiten, slopes, whiten)
+    relative = np.einsum("mk,kl,ml->m", gradient, uncertainty, gradient).max()
+    freedom = float(np.clip(2 / max(relative, 1e-300), 2.5, 1e6))
+    quantile = d * f.ppf(_COVERAGE, d, freedom)
+    return max(1.0, float(quantile / chi2.ppf(_COVERAGE, d)))
+
+
 def mean_levels(system: System, variance: Array) -> Array:
     """Mean of each variance (k,), given that where its likelihood is largest.
 
     They differ where the likelihood is largest near zero: what the residuals do not exclude.
     """
-    information = _information(system, variance)
-    count = len(system.directions)
-    for k, kind in enumerate(system.shared.values(), count):
-        information[k, k] += _NOTHING_SEEN / kind.usual**4
-    sigma = np.sqrt(2 * np.diag(normal_inverse(information, _RIDGE)))
+    spread = level_uncertainty(system, variance)
+    sigma = np.sqrt(np.diag(spread))
     ratio = np.minimum(variance / sigma, 30.0)
-    return variance + _AT_ZERO * sigma * norm.pdf(ratio) / norm.cdf(ratio)
+    excess = _AT_ZERO * sigma * norm.pdf(ratio) / norm.cdf(ratio)
+    # A kind that grows takes from kinds that look like it.
+    return np.maximum(variance + spread @ (excess / sigma**2), _LEAST_LEFT * variance)
 
 
-def _information(system: System, variance: Array) -> Array:
-    """(k, k) twice the expected information of the residuals on the variances."""
+def level_uncertainty(system: System, variance: Array) -> Array:
+    """(k, k) covariance of the variances, by their expected information."""
     noise = Noise(system, variance)
     weighted = noise.weighted(system.jacobian)
     factor, _ = _factor(normal_matrix(system, weighted))
@@ -155,7 +196,11 @@ def _information(system: System, variance: Array) -> Array:
     # Which effects are of which kind.
     ranks = [kind.shape[1] for kind in kinds]
     member = np.eye(len(kinds))[np.repeat(np.arange(len(kinds)), ranks)]
-    return member.T @ between**2 @ member
+    information = member.T @ between**2 @ member
+    count = len(system.directions)
+    for k, kind in enumerate(system.shared.values(), count):
+        information[k, k] += _NOTHING_SEEN / kind.usual**4
+    return 2 * normal_inverse(information, _RIDGE)
 
 
 def _likelihood(logarithms: Array, system: System) -> tuple[float, Array]:
@@ -174,10 +219,13 @@ def _likelihood(logarithms: Array, system: System) -> tuple[float, Array]:
     own = noise.blocks() - half @ half.transpose(0, 2, 1)
     slope = []
     count = len(system.directions)
-    for size, spread in zip(variance[:count], system.directions.values(), strict=True):
+    first = _first_levels(system)
+    kinds = zip(variance, first, system.directions.values(), strict=False)
+    for size, usual, spread in kinds:
         expected = (spread * (own @ spread)).sum()
         observed = ((spread.transpose(0, 2, 1) @ pull[..., None]) ** 2).sum()
-        slope.append(size * (expected - observed))
+        slope.append(size * (expected - observed) + _PSEUDO * (1 - usual / size))
+        value += _PSEUDO * (np.log(size) + usual / size)
     rows = pull.size
     effects = noise.shared.reshape(rows, noise.shared.shape[2]).T
     observed = (effects @ pull.ravel()) ** 2

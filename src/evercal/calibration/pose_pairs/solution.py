@@ -33,6 +33,11 @@ _CAUSES = {
     "depth": "distance from camera to board, image by image",
     "rotation about board": "rotation of the board in the image",
     "rotation about gripper": "rotation of the robot's gripper",
+    "joint offsets": "offsets of the arm's joints",
+    "smooth translation": "smooth errors of the arm or the board, translation",
+    "smooth rotation": "smooth errors of the arm or the board, rotation",
+    "drift translation": "drift of the arm over the recording, translation",
+    "drift rotation": "drift of the arm over the recording, rotation",
     "known": "corners of the board",
     "intrinsics": "intrinsics",
     "shared depth": "distance from camera to board, all images",
@@ -197,6 +202,4 @@ class PairSolution:
             part = fit.contributions.get(name, np.zeros((6, 6)))
             if np.trace(part) > least:
                 terms.append(ErrorTerm.of(cause, part))
-        rest = fit.covariance[:6, :6] - sum(fit.contributions.values())
-        rest_name = "few poses, and errors alike in similar poses"
-        return (*terms, ErrorTerm.of(rest_name, rest))
+        return tuple(terms)

@@ -25,6 +25,7 @@ from evercal.calibration.pose_pairs.fit import (
     robust_fit,
 )
 from evercal.calibration.pose_pairs.mistakes import require_agreement
+from evercal.calibration.pose_pairs.noise_levels import evidence_of_shared
 from evercal.calibration.pose_pairs.pairs import BoardCorners as BoardCorners
 from evercal.calibration.pose_pairs.pairs import (
     Measured,
@@ -44,6 +45,8 @@ from evercal.typing import BoolArray, IntArray
 
 _USUAL = ArmErrors()
 """An arm of which nothing is known."""
+_WANTED = 1.0
+"""Evidence of errors that poses share, logarithm of the likelihood ratio, that takes them in."""
 _REACH_M = 0.4
 """Distance from the gripper of what it carries above which the mount may be the other one."""
 _OTHER_MOUNT = 4.0
@@ -117,8 +120,10 @@ def solve_pose_pairs(
     slip = find_slip(equation, fit, rows)
     kinds = shared_errors(pairs.base_from_gripper, errors)
     shared = {name: kind[rows] for name, kind in kinds.items()}
-    equation = replace(equation, shared=shared)
-    fit = robust_fit(equation, agreement(equation, fit.at))
+    sharing = replace(equation, shared=shared)
+    if evidence_of_shared(sharing[fit.inliers].system(fit.at)) > _WANTED:
+        equation = sharing
+        fit = robust_fit(equation, agreement(equation, fit.at))
     warnings: list[str] = []
     if scale_known:
         equation, fit, warnings = with_tested_size(equation, fit, corners, of_board)
