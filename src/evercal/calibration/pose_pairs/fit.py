@@ -143,13 +143,11 @@ def robust_fit(
     fit = _result(equation, at, inliers, levels)
     if equation.shared:
         return fit
-    slopes = [
-        fit.contributions[kind] / level
-        for kind, level in zip(judges.directions, levels, strict=True)
-    ]
-    factor = ellipsoid_factor(
-        fit.covariance[:6, :6], np.stack(slopes), level_uncertainty(judges, levels)
-    )
+    slopes = []
+    for kind, level in zip(judges.directions, levels, strict=True):
+        slopes.append(fit.contributions[kind] / level)
+    uncertainty = level_uncertainty(judges, levels)
+    factor = ellipsoid_factor(fit.covariance[:6, :6], np.stack(slopes), uncertainty)
     return replace(fit, covariance=factor * fit.covariance)
 
 
