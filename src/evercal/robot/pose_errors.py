@@ -57,7 +57,7 @@ class ArmErrors(NamedTuple):
 def shared_errors(base_from_gripper: SE3, errors: ArmErrors) -> dict[str, SharedErrors]:
     """Kinds of errors of gripper poses (n,) in the order of time, by name."""
     accuracy_rad = errors.accuracy_rad
-    joints = joint_slopes(base_from_gripper, errors.arm)
+    joints = _main_effects(joint_slopes(base_from_gripper, errors.arm))
     n = len(base_from_gripper)
     metres, radians = pose_distance(base_from_gripper[:, None], base_from_gripper)
     apart = np.sqrt(3 * (metres / _SMOOTH_M) ** 2 + 3 * (radians / _SMOOTH_RAD) ** 2)
@@ -77,6 +77,14 @@ def shared_errors(base_from_gripper: SE3, errors: ArmErrors) -> dict[str, Shared
         kinds[f"{name} translation"] = SharedErrors(shift.reshape(n, 6, -1), moved_m)
         kinds[f"{name} rotation"] = SharedErrors(turn.reshape(n, 6, -1), accuracy_rad)
     return kinds
+
+
+def _main_effects(slopes: Array) -> Array:
+    """(n, 6, r) fewer effects with nearly the covariance of (n, 6, k)."""
+    columns = slopes.reshape(-1, slopes.shape[2])
+    effects, size, _ = np.linalg.svd(columns, full_matrices=False)
+    large = size**2 > _LEAST_SHARE * size[0] ** 2
+    return (effects[:, large] * size[large]).reshape(*slopes.shape[:2], -1)
 
 
 def _effects(correlation: Array) -> Array:

@@ -40,6 +40,8 @@ class Slip(NamedTuple):
     """Angle of its rotation."""
     spread: Array
     """(p, p) to add to the covariance of the unknowns: they differ before and after the step."""
+    evidence: float
+    """Logarithm of the likelihood ratio to no step, less the number of its parameters."""
 
 
 _FIRST_UNKNOWN = {"camera": 0, "board": 6}
@@ -114,6 +116,7 @@ def find_slip(
         float(metres),
         float(radians),
         spread,
+        float(freedom / 2 * np.log(best[""].cost / step.cost) - 6),
     )
 
 

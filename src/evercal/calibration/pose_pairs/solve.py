@@ -121,7 +121,11 @@ def solve_pose_pairs(
     kinds = shared_errors(pairs.base_from_gripper, errors)
     shared = {name: kind[rows] for name, kind in kinds.items()}
     sharing = replace(equation, shared=shared)
-    if evidence_of_shared(sharing[fit.inliers].system(fit.at)) > _WANTED:
+    evidence = evidence_of_shared(sharing[fit.inliers].system(fit.at))
+    # Errors that poses share look like a step, and a step like errors that poses share.
+    if slip is not None and slip.evidence < evidence:
+        slip = None
+    if slip is None and evidence > _WANTED:
         equation = sharing
         fit = robust_fit(equation, agreement(equation, fit.at))
     warnings: list[str] = []
