@@ -14,7 +14,7 @@ import numpy as np
 from evercal.geometry import SE3, pose_distance
 from evercal.robot.arm import Arm
 from evercal.robot.joint_slopes import joint_slopes
-from evercal.typing import Array, IntArray
+from evercal.typing import Array, BoolArray, IntArray
 
 USUAL_ACCURACY_RAD = np.deg2rad(0.2)
 """Size of joint offsets of an arm of which nothing is known, one standard deviation."""
@@ -41,7 +41,8 @@ class SharedErrors(NamedTuple):
     usual: float
     """Prior standard deviation of the size, metres or radians."""
 
-    def __getitem__(self, rows: IntArray) -> "SharedErrors":
+    def of_rows(self, rows: IntArray | BoolArray) -> "SharedErrors":
+        """The errors of some of the poses."""
         return self._replace(slopes=self.slopes[rows])
 
 
@@ -60,20 +61,26 @@ def shared_errors(base_from_gripper: SE3, errors: ArmErrors) -> dict[str, Shared
     joints = _main_effects(joint_slopes(base_from_gripper, errors.arm))
     n = len(base_from_gripper)
     metres, radians = pose_distance(base_from_gripper[:, None], base_from_gripper)
-    apart = np.sqrt(3 * (metres / _SMOOTH_M) ** 2 + 3 * (radians / _SMOOTH_RAD) ** 2)
+    shares = (metres / _SMOOTH_M) ** 2 + (radians / _SMOOTH_RAD) ** 2
+    apart = np.sqrt(3 * shares)
     # Matern covariance of order 3/2: smooth, with details of all sizes.
     smooth = (1 + apart) * np.exp(-apart)
     samples = max(_DRIFT_SAMPLES, 2 * n / _MOST_PLACES)
-    steps = np.subtract.outer(np.arange(n), np.arange(n)) / samples
+    times = np.arange(n) / samples
+    steps = times[:, None] - times
     drift = np.exp(-0.5 * steps**2)
+    moved_m = accuracy_rad * _USUAL_REACH_M
     kinds = {"joint offsets": SharedErrors(joints, accuracy_rad)}
-    for name, correlation in (("smooth", smooth), ("drift", drift)):
+    correlations = {
+        "smooth": smooth,
+        "drift": drift,
+    }
+    for name, correlation in correlations.items():
         effects = _effects(correlation)
         shift, turn = np.zeros((2, n, 6, 3, effects.shape[1]))
         for axis in range(3):
             shift[:, axis, axis] = effects
             turn[:, 3 + axis, axis] = effects
-        moved_m = accuracy_rad * _USUAL_REACH_M
         kinds[f"{name} translation"] = SharedErrors(shift.reshape(n, 6, -1), moved_m)
         kinds[f"{name} rotation"] = SharedErrors(turn.reshape(n, 6, -1), accuracy_rad)
     return kinds
@@ -83,8 +90,10 @@ def _main_effects(slopes: Array) -> Array:
     """(n, 6, r) fewer effects with nearly the covariance of (n, 6, k)."""
     columns = slopes.reshape(-1, slopes.shape[2])
     effects, size, _ = np.linalg.svd(columns, full_matrices=False)
-    large = size**2 > _LEAST_SHARE * size[0] ** 2
-    return (effects[:, large] * size[large]).reshape(*slopes.shape[:2], -1)
+    least = np.sqrt(_LEAST_SHARE) * size[0]
+    large = size > least
+    main = effects[:, large] * size[large]
+    return main.reshape(len(slopes), 6, -1)
 
 
 def _effects(correlation: Array) -> Array:

@@ -9,7 +9,7 @@ inverted as such (M. Woodbury, Inverting modified matrices, 1950).
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg import block_diag, lapack, solve_triangular
+from scipy.linalg import block_diag, cho_solve, solve_triangular
 from scipy.optimize import minimize
 from scipy.stats import chi2, f, norm
 
@@ -83,11 +83,7 @@ class Noise:
 
     def unexplained(self) -> Array:
         """(r, r) covariance of the effects, if all other unknowns were known."""
-        rank = len(self._root)
-        if not rank:
-            return np.zeros((0, 0))
-        inverse, _ = lapack.dpotri(self._root, lower=1)
-        return np.tril(inverse) + np.tril(inverse, -1).T
+        return cho_solve((self._root, True), np.eye(len(self._root)))
 
     def logarithm(self) -> float:
         """Logarithm of the determinant of the covariance."""
@@ -126,7 +122,7 @@ def estimate_levels(system: System, start: Array | None = None) -> Array:
     found = minimize(
         _likelihood,
         np.log(at),
-        args=(system,),
+        args=(system, first),
         jac=True,
         method="L-BFGS-B",
         bounds=bounds,
@@ -141,7 +137,7 @@ def evidence_of_shared(system: System) -> float:
     least = []
     for one in (alone, system):
         logarithms = np.log(estimate_levels(one))
-        least.append(_likelihood(logarithms, one)[0])
+        least.append(_likelihood(logarithms, one, _first_levels(one))[0])
     return (least[0] - least[1]) / 2
 
 
@@ -186,7 +182,9 @@ def level_uncertainty(system: System, variance: Array) -> Array:
     weighted = noise.weighted(system.jacobian)
     factor, _ = _factor(normal_matrix(system, weighted))
     rows = system.residual.size
-    kinds = [block_diag(*directions) for directions in system.directions.values()]
+    kinds: list[Array] = []
+    for directions in system.directions.values():
+        kinds.append(np.asarray(block_diag(*directions)))
     for kind in system.shared.values():
         kinds.append(kind.slopes.reshape(rows, -1))
     effects = np.concatenate(kinds, 1)
@@ -203,8 +201,11 @@ def level_uncertainty(system: System, variance: Array) -> Array:
     return 2 * normal_inverse(information, _RIDGE)
 
 
-def _likelihood(logarithms: Array, system: System) -> tuple[float, Array]:
-    """Twice the negative logarithm of the restricted likelihood, and its slope."""
+def _likelihood(logarithms: Array, system: System, first: Array) -> tuple[float, Array]:
+    """Twice the negative logarithm of the restricted likelihood, and its slope.
+
+    `first` are rough variances, the size of the pseudo-residuals.
+    """
     variance = np.exp(logarithms)
     noise = Noise(system, variance)
     weighted = noise.weighted(system.jacobian)
@@ -219,25 +220,24 @@ def _likelihood(logarithms: Array, system: System) -> tuple[float, Array]:
     own = noise.blocks() - half @ half.transpose(0, 2, 1)
     slope = []
     count = len(system.directions)
-    first = _first_levels(system)
     kinds = zip(variance, first, system.directions.values(), strict=False)
-    for size, usual, spread in kinds:
+    for size, level, spread in kinds:
         expected = (spread * (own @ spread)).sum()
         observed = ((spread.transpose(0, 2, 1) @ pull[..., None]) ** 2).sum()
-        slope.append(size * (expected - observed) + _PSEUDO * (1 - usual / size))
-        value += _PSEUDO * (np.log(size) + usual / size)
+        slope.append(size * (expected - observed) + _PSEUDO * (1 - level / size))
+        value += _PSEUDO * (np.log(size) + level / size)
     rows = pull.size
     effects = noise.shared.reshape(rows, noise.shared.shape[2]).T
     observed = (effects @ pull.ravel()) ** 2
     explained = ((effects @ half.reshape(rows, -1)) ** 2).sum(1)
     expected = 1 - np.diag(noise.unexplained()) - explained
-    first = 0
+    begin = 0
     for size, kind in zip(variance[count:], system.shared.values(), strict=True):
-        last = first + kind.slopes.shape[2]
+        end = begin + kind.slopes.shape[2]
         usual = size / kind.usual**2
         value += usual
-        slope.append((expected - observed)[first:last].sum() + usual)
-        first = last
+        slope.append((expected - observed)[begin:end].sum() + usual)
+        begin = end
     return float(value), np.array(slope)
 
 
@@ -251,8 +251,19 @@ def _factor(normal: Array) -> tuple[Array, float]:
 
 
 def _first_levels(system: System) -> Array:
-    metres2 = np.mean(system.residual[:, :3] ** 2)
-    radians2 = np.mean(system.residual[:, 3:] ** 2)
+    """Rough variances of all kinds, by the residuals of a fit with equal weights."""
+    rough = _levels_of(system, system.residual)
+    alone = replace(system, shared={})
+    noise = Noise(alone, rough[: len(system.directions)])
+    weighted = noise.weighted(system.jacobian)
+    factor, _ = _factor(normal_matrix(system, weighted))
+    step = -factor @ (factor.T @ slope_of(system, weighted))
+    return _levels_of(system, system.residual + system.jacobian @ step)
+
+
+def _levels_of(system: System, residual: Array) -> Array:
+    metres2 = np.mean(residual[:, :3] ** 2)
+    radians2 = np.mean(residual[:, 3:] ** 2)
     levels = []
     for kind in system.directions:
         own = radians2 if kind.startswith("rotation") else metres2

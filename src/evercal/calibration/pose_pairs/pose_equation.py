@@ -162,7 +162,7 @@ class PoseEquation:
             if isinstance(value, np.ndarray):
                 changed[name] = value[index]
         extras = replace(self.extras, slopes=self.extras.slopes[index])
-        shared = {name: kind[index] for name, kind in self.shared.items()}
+        shared = {name: kind.of_rows(index) for name, kind in self.shared.items()}
         return replace(self, extras=extras, shared=shared, **changed)
 
     def __len__(self) -> int:

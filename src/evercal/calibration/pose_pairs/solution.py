@@ -202,4 +202,5 @@ class PairSolution:
             part = fit.contributions.get(name, np.zeros((6, 6)))
             if np.trace(part) > least:
                 terms.append(ErrorTerm.of(cause, part))
-        return tuple(terms)
+        rest = fit.covariance[:6, :6] - sum(fit.contributions.values())
+        return (*terms, ErrorTerm.of("few poses", rest))

@@ -74,11 +74,12 @@ def solve(
     depth error that all images share are unknowns with a prior of 0.2 %. A size that the robot's
     motions contradict is reported and estimated.
 
-    The covariance allows for the uncertainty of the noise estimate: the usual chi-square quantiles
-    hold (12.59 for 95 % in six dimensions).
+    Errors of the robot's poses that they share, see `shared_errors`, are taken in where the pairs
+    show them. The covariance allows for the uncertainty of the noise estimate: the usual chi-square
+    quantiles hold (12.59 for 95 % in six dimensions).
 
     Args:
-        pairs: Pose pairs; their order does not matter.
+        pairs: Pose pairs in the order of time.
         mount: `eye_in_hand`: the gripper carries the camera and the board is fixed.
             `eye_to_hand`: the camera is fixed and the gripper carries the board.
         scale_known: Whether the camera's translations are in metres; otherwise their scale is
@@ -119,7 +120,7 @@ def solve_pose_pairs(
     equation, fit, lens = problem.fitted(pairs, rows, start.at, lens)
     slip = find_slip(equation, fit, rows)
     kinds = shared_errors(pairs.base_from_gripper, errors)
-    shared = {name: kind[rows] for name, kind in kinds.items()}
+    shared = {name: kind.of_rows(rows) for name, kind in kinds.items()}
     sharing = replace(equation, shared=shared)
     evidence = evidence_of_shared(sharing[fit.inliers].system(fit.at))
     # Errors that poses share look like a step, and a step like errors that poses share.
