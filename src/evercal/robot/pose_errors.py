@@ -58,7 +58,11 @@ class ArmErrors(NamedTuple):
 def shared_errors(base_from_gripper: SE3, errors: ArmErrors) -> dict[str, SharedErrors]:
     """Kinds of errors of gripper poses (n,) in the order of time, by name."""
     accuracy_rad = errors.accuracy_rad
-    joints = _main_effects(joint_slopes(base_from_gripper, errors.arm))
+    slopes = joint_slopes(
+        base_from_gripper,
+        errors.arm,
+    )
+    joints = _main_effects(slopes)
     n = len(base_from_gripper)
     metres, radians = pose_distance(base_from_gripper[:, None], base_from_gripper)
     shares = (metres / _SMOOTH_M) ** 2 + (radians / _SMOOTH_RAD) ** 2
@@ -70,19 +74,30 @@ def shared_errors(base_from_gripper: SE3, errors: ArmErrors) -> dict[str, Shared
     steps = times[:, None] - times
     drift = np.exp(-0.5 * steps**2)
     moved_m = accuracy_rad * _USUAL_REACH_M
-    kinds = {"joint offsets": SharedErrors(joints, accuracy_rad)}
+    kinds = {}
+    kinds["joint offsets"] = SharedErrors(
+        joints,
+        accuracy_rad,
+    )
     correlations = {
         "smooth": smooth,
         "drift": drift,
     }
     for name, correlation in correlations.items():
         effects = _effects(correlation)
-        shift, turn = np.zeros((2, n, 6, 3, effects.shape[1]))
+        shape = (2, n, 6, 3, effects.shape[1])
+        shift, turn = np.zeros(shape)
         for axis in range(3):
             shift[:, axis, axis] = effects
             turn[:, 3 + axis, axis] = effects
-        kinds[f"{name} translation"] = SharedErrors(shift.reshape(n, 6, -1), moved_m)
-        kinds[f"{name} rotation"] = SharedErrors(turn.reshape(n, 6, -1), accuracy_rad)
+        kinds[f"{name} translation"] = SharedErrors(
+            shift.reshape(n, 6, -1),
+            moved_m,
+        )
+        kinds[f"{name} rotation"] = SharedErrors(
+            turn.reshape(n, 6, -1),
+            accuracy_rad,
+        )
     return kinds
 
 
@@ -102,7 +117,15 @@ def _effects(correlation: Array) -> Array:
     C. Williams and M. Seeger, Using the Nystroem method to speed up kernel machines, 2000.
     """
     n = len(correlation)
-    places = np.linspace(0, n - 1, min(n, _MOST_PLACES)).round().astype(int)
-    values, axes = np.linalg.eigh(correlation[np.ix_(places, places)])
+    count = min(n, _MOST_PLACES)
+    places = np.linspace(
+        0,
+        n - 1,
+        count,
+    )
+    places = places.round().astype(int)
+    among = correlation[np.ix_(places, places)]
+    values, axes = np.linalg.eigh(among)
     large = values > _LEAST_SHARE * values[-1]
-    return correlation[:, places] @ (axes[:, large] / np.sqrt(values[large]))
+    scaled = axes[:, large] / np.sqrt(values[large])
+    return correlation[:, places] @ scaled
