@@ -1,4 +1,5 @@
 import json
+import re
 from importlib import resources
 from pathlib import Path
 from typing import get_args
@@ -43,6 +44,13 @@ def test_each_arm_is_complete(name: str) -> None:
 def test_the_table_is_plain_json() -> None:
     text = resources.files("evercal.robot").joinpath("arms.json").read_text("utf-8")
     assert list(json.loads(text)) == list(ARM_NAMES)
+
+
+def test_the_page_lists_the_table() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "arms.md").read_text("utf-8")
+    rows = re.findall(r"^\| `(.+)` \| .+ \| (.+) \| .+ \| .+ \| .+ \|$", page, re.M)
+    assert rows == list(ARM_NAMES.items())
+    assert f"the kinematics of {len(rows)} arms" in page
 
 
 def test_another_name_is_refused_with_those_that_are_known() -> None:
