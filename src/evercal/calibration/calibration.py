@@ -4,12 +4,14 @@
      "parent_frame": "base", "child_frame": "camera",
      "meaning": "pose of camera in base: takes points from camera to base",
      "translation_m": [3], "quaternion_wxyz": [4], "matrix": [4][4],
-     "covariance": [6][6], "sigma_mm": x, "sigma_deg": x, "camera": {...}, "images": [...],
+     "covariance": [6][6], "sigma_mm": x, "sigma_deg": x, "camera": {...}, "lens": "stated",
+     "lenses": {"stated": {...}, "estimated": {...}}, "images": [...],
      "error_terms": [...], "checks": {...}, "joints": [...], "joint_covariance": [k][k],
      "verdict": "...", "source": {...}, "created": "..."}
 
-Metres, radians, quaternions w, x, y, z, OpenCV camera axes. `matrix`, `meaning` and the sigmas
-repeat other values for their readers.
+Metres, radians, quaternions w, x, y, z, OpenCV camera axes. The pose belongs to `camera`, which is
+the one of `lenses` that `lens` names. `matrix`, `meaning`, `lens` and the sigmas repeat other
+values for their readers.
 """
 
 import itertools
@@ -153,6 +155,8 @@ class Calibration(FramedPose):
             "sigma_mm": self.sigma_mm,
             "sigma_deg": self.sigma_deg,
             "camera": None if self.camera is None else self.camera.to_dict(),
+            "lens": self.lens,
+            "lenses": {name: own.to_dict() for name, own in self.lenses.items()},
             "images": [vars(image) for image in self.images],
             "error_terms": [vars(term) for term in self.error_terms],
             "checks": self.checks.to_dict(),
@@ -174,7 +178,7 @@ class Calibration(FramedPose):
             raise ValueError(
                 f"'mount' is one of {get_args(MountName)}, got {data.get('mount')!r}"
             )
-        for name in ("checks", "source"):
+        for name in ("checks", "source", "lenses"):
             if not isinstance(data.get(name, {}), Mapping):
                 raise ValueError(f"{name!r} is an object")
         pose = SE3(data["quaternion_wxyz"], data["translation_m"])
@@ -194,6 +198,7 @@ class Calibration(FramedPose):
             parent_frame=str(data["parent_frame"]),
             child_frame=str(data["child_frame"]),
             camera=None if lens is None else Camera.from_dict(lens),
+            lenses={k: Camera.from_dict(v) for k, v in data.get("lenses", {}).items()},
             images=tuple(ImageUse(**row) for row in data.get("images", [])),
             error_terms=tuple(ErrorTerm(**row) for row in data.get("error_terms", [])),
             checks=checks_of(data.get("checks", {})),

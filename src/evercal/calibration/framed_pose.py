@@ -1,11 +1,14 @@
 """`FramedPose`: the pose of a camera between two named frames, as other programs take it."""
 
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
 import numpy as np
 
+from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.geometry.rays import fit_rays
 from evercal.robot.mount import MountName, mount_named
 from evercal.typing import Array
 
@@ -57,7 +60,7 @@ class FramedPose:
     child_frame: str = "camera"
     """The camera's optical frame: x right, y down, z forward."""
     camera: Camera | None = None
-    """Intrinsics of the images."""
+    """Intrinsics that the pose belongs to: with others, its rays are others. See `for_lens`."""
     images: tuple[ImageUse, ...] = ()
     """All images in the given order."""
     joints: tuple[JointOffset, ...] = field(default=(), kw_only=True)
@@ -67,6 +70,8 @@ class FramedPose:
         default_factory=lambda: np.zeros((0, 0)), kw_only=True
     )
     """(k, k) of the offsets."""
+    lenses: Mapping[str, Camera] = field(default_factory=dict, kw_only=True)
+    """Intrinsics of this camera by their origin: `stated` with the images, and `estimated`."""
 
     @property
     def on_gripper(self) -> bool:
@@ -84,6 +89,55 @@ class FramedPose:
     def uncertain_pose(self) -> UncertainPose:
         """`parent_from_child` with its covariance."""
         return UncertainPose(self.parent_from_child, self.covariance)
+
+    @property
+    def lens(self) -> str:
+        """Name of the intrinsics that the pose belongs to, see `lenses`; empty if unknown."""
+        return next((k for k, own in self.lenses.items() if own == self.camera), "")
+
+    @property
+    def lens_left_rad(self) -> float:
+        """Angle by which rays leave the estimated ones: root mean square over the image's middle.
+
+        No pose takes it away, only the estimated intrinsics do.
+        """
+        estimated = self.lenses.get("estimated")
+        if estimated is None or self.camera in (None, estimated):
+            return 0.0
+        left = fit_rays(estimated, self.camera).left_rad
+        return float(np.sqrt((left**2).mean()))
+
+    def for_lens(self, lens: Camera | str) -> Self:
+        """The pose for other intrinsics: a name in `lenses`, or `given` ones.
+
+        Principal point and distortion trade against a rotation. So the pose is turned until its
+        rays agree best with those of before, over the middle of the image.
+
+        Raises:
+            InputError: The calibration has no such intrinsics, or their images differ in size.
+        """
+        lenses = dict(self.lenses)
+        if isinstance(lens, Camera):
+            lenses["given"] = lens
+        elif lens not in lenses:
+            known = ", ".join(lenses) or "no other intrinsics"
+            raise InputError(f"`lens` {lens}: this calibration has {known}")
+        else:
+            lens = lenses[lens]
+        if self.camera is None:
+            raise InputError("`lens`: this calibration holds no intrinsics")
+        try:
+            turn = fit_rays(self.camera, lens).own_from_other
+        except ValueError as error:
+            raise InputError(f"`lens`: {error}") from None
+        moved = self.uncertain_pose @ SE3.of(turn, np.zeros(3))
+        return replace(
+            self,
+            parent_from_child=moved.pose,
+            covariance=moved.covariance,
+            camera=lens,
+            lenses=lenses,
+        )
 
     def transform_to_dict(self) -> dict[str, Any]:
         """Return JSON values of the transform."""

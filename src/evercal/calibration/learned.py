@@ -56,10 +56,10 @@ def learned_calibration(root: Path, scene: str | None = None) -> Calibration:
     if "calibration" in report:
         calibration = Calibration.from_dict(report["calibration"])
     else:
-        calibration = _of_version_0_1(report)
+        calibration = replace(_of_version_0_1(report), camera=camera)
     # The scene may have another name now.
     source = {**calibration.source, "scene": name}
-    return replace(calibration, camera=camera, source=source)
+    return replace(calibration, source=source)
 
 
 def _of_version_0_1(report: Mapping[str, Any]) -> Calibration:

@@ -34,6 +34,12 @@ COEFFICIENTS: dict[str, tuple[str, ...]] = {
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
 """Names of the distortion coefficients of each model, in OpenCV's order."""
+USUAL_DISTORTION = {
+    "pinhole": (0.3, 0.5, 2e-3, 2e-3, 0.5),
+    "fisheye": (0.1,) * 4,
+}
+"""Standard deviations of the coefficients of an unknown lens. Files of real lenses err as much:
+many state no distortion."""
 _COEFFICIENT_COUNTS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
 """Allowed numbers of coefficients of each model."""
 _EXACT = 1e-10
@@ -154,9 +160,13 @@ class Camera:
         return replace(self, distortion=(), model="pinhole")
 
     def changed(self, change: ArrayLike) -> "Camera":
-        """The camera after a change (5,) of the parameters of `slopes`."""
-        log_focal, x, y, more_k1, more_k2 = np.asarray(change, np.float64).tolist()
-        k1, k2, *others = self.coefficients[: max(4, len(self.distortion))]
+        """The camera after a change (3 + k,) of the parameters of `slopes`."""
+        log_focal, x, y, *more = np.asarray(change, np.float64).tolist()
+        terms = [*self.distortion, *(0.0,) * (len(more) - len(self.distortion))]
+        for i, term in enumerate(more):
+            terms[i] += term
+        least = _COEFFICIENT_COUNTS[self.model][1]
+        terms += [0.0] * (least - len(terms))
         factor = math.exp(log_focal)
         return replace(
             self,
@@ -164,7 +174,7 @@ class Camera:
             fy=factor * self.fy,
             cx=self.cx + x,
             cy=self.cy + y,
-            distortion=(k1 + more_k1, k2 + more_k2, *others),
+            distortion=tuple(terms[: len(COEFFICIENTS[self.model])]),
         )
 
     def fits(self, width: int, height: int) -> bool:
@@ -248,11 +258,12 @@ class Camera:
         depth = np.ones((*plane.shape[:-1], 1))
         return np.concatenate([plane, depth], axis=-1)
 
-    def slopes(self, plane: ArrayLike) -> tuple[Array, Array]:
+    def slopes(self, plane: ArrayLike, terms: int = 2) -> tuple[Array, Array]:
         """Derivatives of pixels by ideal points (..., 2) of the plane z = 1, and by intrinsics.
 
-        The first are (..., 2, 2). The others are (..., 2, 5): by the logarithm of both focal
-        lengths, the principal point in pixels, k1 and k2.
+        The first are (..., 2, 2). The others are (..., 2, 3 + terms): by the logarithm of both
+        focal lengths, the principal point in pixels, and the first distortion coefficients in
+        OpenCV's order, at most five.
         """
         plane = np.asarray(plane, dtype=np.float64)
         x = plane[..., 0]
@@ -260,7 +271,7 @@ class Camera:
         (u, v), (a, b, d) = self._distorted(x, y)
         # One row for each entry: products of small matrices take several times as long.
         by_plane = np.empty((2, 2, *x.shape))
-        lens = np.zeros((2, 5, *x.shape))
+        lens = np.zeros((2, 3 + max(terms, 2), *x.shape))
         by_plane[0, 0] = self.fx * a
         by_plane[0, 1] = self.fx * b
         by_plane[1, 0] = self.fy * b
@@ -281,6 +292,16 @@ class Camera:
         lens[0, 3] = self.fx * x * first
         lens[1, 3] = self.fy * y * first
         lens[:, 4] = lens[:, 3] * next_power
+        if terms > 2 and self.model == "fisheye":
+            lens[:, 5] = lens[:, 4] * next_power
+            lens[:, 6] = lens[:, 5] * next_power
+        elif terms > 2:
+            lens[0, 5] = lens[1, 6] = 2 * x * y
+            lens[1, 5] = r2 + 2 * y * y
+            lens[0, 6] = r2 + 2 * x * x
+            lens[0, 5:7] *= self.fx
+            lens[1, 5:7] *= self.fy
+            lens[:, 7] = lens[:, 4] * next_power
         by_plane = np.moveaxis(by_plane, (0, 1), (-2, -1))
         return by_plane, np.moveaxis(lens, (0, 1), (-2, -1))
 

@@ -88,6 +88,7 @@ def learn_held_thing(
         arm=start.arm,
         confirmed=start.confirmed,
         swept_frames=SWEPT_FRAMES,
+        whole=recording.train[0].camera,
     )
     options = sized(options, budget, contents)
     options = replace(options, metric=recording.metric)

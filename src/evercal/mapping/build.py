@@ -15,7 +15,7 @@ from evercal.errors import InputError, require_numbers
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera
 from evercal.mapping.arm_offsets import joint_slopes, with_offsets
-from evercal.mapping.built_map import Adjusted, BuiltMap, HandEyeCorrection
+from evercal.mapping.built_map import Adjusted, BuiltMap, HandEyeCorrection, of_rays
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.bundle_tracks import bundle_tracks
@@ -50,6 +50,10 @@ from evercal.typing import Array, IntArray
 HAND_EYE_COVARIANCE_SCALE = 2.5
 """Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated
 over many frames, which residuals do not show (research/handeye.md)."""
+LENS_SIGMA = (0.005, 0.007)
+"""`BundleOptions.lens_sigma` of a hand-eye calibration: 0.5 % of the focal length, and about 0.5 %
+of the width for the principal point. Ten files and methods of one camera differ by as much
+(research/handeye.md)."""
 NOTICEABLE_RAD = 1e-4
 """Landmarks are tracked again if poses and intrinsics moved their projections by more than this:
 some hundredths of a pixel."""
@@ -84,6 +88,8 @@ class MapOptions:
     """Names of frames whose stated poses are known to agree with the images."""
     mount: Mount | None = None
     """Mount of a camera whose poses follow from those of a gripper; see `for_hand_eye`."""
+    whole: Camera | None = None
+    """Intrinsics of whole images, where the frames are windows of them."""
 
     def __post_init__(self) -> None:
         """Refuse numbers outside their range.
@@ -106,6 +112,7 @@ class MapOptions:
             least_systematic=1.0,
             common_sigma_m=0.2,
             common_sigma_deg=10.0,
+            lens_sigma=LENS_SIGMA,
             least_sigma_m=2e-4,
             least_sigma_deg=0.015,
         )
@@ -382,18 +389,18 @@ def _hand_eye(
     adjustment: Adjustment,
     options: MapOptions,
 ) -> HandEyeCorrection:
-    by_noise = adjustment.common_covariance
+    scale = 1.0
     if options.mount is not None and options.mount.moves:
-        by_noise = HAND_EYE_COVARIANCE_SCALE * by_noise
+        scale = HAND_EYE_COVARIANCE_SCALE
+    camera = frames.cameras[0]
+    by_cause = of_rays(adjustment, camera, options.whole or camera, scale)
     arm = None
     if options.arm is not None and len(adjustment.offsets):
         arm = _offsets(options.arm, adjustment)
     names = frames.names(np.arange(len(frames)))
     return HandEyeCorrection(
         adjustment.common,
-        by_noise - adjustment.common_by_lens,
-        adjustment.common_by_lens,
-        adjustment.common_systematic,
+        *by_cause,
         dict(zip(names, adjustment.errors, strict=True)),
         dict(zip(names, adjustment.correction, strict=True)),
         arm,

@@ -7,8 +7,10 @@ from typing import Self
 import numpy as np
 
 from evercal.geometry import SE3, Camera
+from evercal.geometry.rays import turn_by_lens
 from evercal.mapping.arm_offsets import with_offsets
 from evercal.mapping.bundle_adjustment import Adjustment
+from evercal.mapping.bundle_equations import DISTORTION, INTRINSICS
 from evercal.mapping.scene_map import LeftOut, SceneMap
 from evercal.recordings.frame import Frame
 from evercal.robot.arm_offsets import ArmOffsets
@@ -111,6 +113,34 @@ def _length_sigma(vector: Array, covariance: Array) -> float:
     length = float(np.linalg.norm(vector))
     distance = float(np.sqrt(vector @ np.linalg.solve(covariance, vector)))
     return length / max(distance, 1e-12)
+
+
+def of_rays(
+    adjustment: Adjustment, camera: Camera, whole: Camera, scale: float
+) -> tuple[Array, Array, Array]:
+    """Covariances (6, 6) of the common transform for the estimated intrinsics, by their causes.
+
+    The transform belongs to its intrinsics: an error of it that trades against one of theirs leaves
+    the rays where they are, and counts as none.
+
+    Args:
+        adjustment: Result of bundle adjustment.
+        camera: Intrinsics that were adjusted.
+        whole: Intrinsics of whole images, where these are windows of them.
+        scale: Factor on the covariance by noise.
+
+    Returns:
+        Of noise, of the uncertainty of the intrinsics, and of errors that vary slowly.
+    """
+    turn = turn_by_lens(whole, DISTORTION)
+    turn[:, 1:3] *= whole.fx / camera.fx
+    rays = np.eye(6, 6 + INTRINSICS)
+    rays[3:, 6:] = -turn
+    joint = rays @ adjustment.lens_covariance
+    lens = adjustment.lens_covariance[6:, 6:]
+    by_lens = joint[:, 6:] @ np.linalg.solve(lens, joint[:, 6:].T)
+    by_noise = scale * joint @ rays.T - by_lens
+    return by_noise, by_lens, rays @ adjustment.lens_systematic @ rays.T
 
 
 @dataclass(frozen=True, eq=False)

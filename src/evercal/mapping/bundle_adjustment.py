@@ -30,7 +30,7 @@ from evercal.mapping.bundle_equations import (
     Solution,
     StatedFrames,
 )
-from evercal.mapping.bundle_options import BundleOptions
+from evercal.mapping.bundle_options import FIXED, BundleOptions
 from evercal.mapping.stated_errors import StatedErrors, Variances
 from evercal.mapping.variance_components import (
     noise_of,
@@ -42,8 +42,6 @@ from evercal.mapping.variance_components import (
 from evercal.robot.arm_offsets import JointSlopes
 from evercal.typing import Array, BoolArray
 
-FIXED = 1e-9
-"""Prior standard deviation of shared parameters that are not adjusted."""
 INVALID_SQUARES = 1e8
 """Squared residual that an observation without a projection counts with."""
 FIRST_DAMPING = 1e-4
@@ -87,12 +85,10 @@ class Adjustment:
     """The same for stated rotations, radians."""
     residual_px: float
     """Median reprojection error, pixels."""
-    common_covariance: Array
-    """(6, 6) of the common transform, camera frame, metres and radians."""
-    common_by_lens: Array
-    """(6, 6) part of it that known intrinsics would take away."""
-    common_systematic: Array
-    """(6, 6) of the same, due to errors of stated poses that vary linearly over the recording."""
+    lens_covariance: Array
+    """(14, 14) of the common transform, camera frame, metres and radians, and the intrinsics."""
+    lens_systematic: Array
+    """(14, 14) of the same, due to errors of stated poses that vary linearly over the recording."""
     correction: Array
     """(n, 6) of each pose beside common transform and time shift, camera frame, metres and
     radians."""
@@ -112,6 +108,16 @@ class Adjustment:
     """(k,) estimated standard deviation of the offsets of this arm."""
     offsets_known: BoolArray
     """(k,) whether the images tell an offset better than the first prior."""
+
+    @property
+    def common_covariance(self) -> Array:
+        """(6, 6) of the common transform, camera frame, metres and radians."""
+        return self.lens_covariance[:COMMON, :COMMON]
+
+    @property
+    def common_systematic(self) -> Array:
+        """(6, 6) of the same, due to errors of stated poses that vary linearly."""
+        return self.lens_systematic[:COMMON, :COMMON]
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +156,7 @@ class BundleAdjustment:
         self.frames = StatedFrames(stated, cameras)
         self.moves = bool(np.abs(velocity).max(initial=0) > 0)
         """Whether a time shift has an effect."""
-        self.distorted = any(cameras[0].distortion)
+        self.camera = cameras[0]
         self.adjusts_camera = options.intrinsics and self.frames.same_lens
         """Whether intrinsics are adjusted."""
 
@@ -193,10 +199,7 @@ class BundleAdjustment:
             shift = o.shift_sigma_frames
         intrinsics = np.full(INTRINSICS, FIXED)
         if self.adjusts_camera:
-            intrinsics[0] = o.focal_sigma
-            intrinsics[1:3] = o.centre_sigma_px
-            if not self.distorted:
-                intrinsics[3:] = o.distortion_sigma
+            intrinsics = o.intrinsics_sigma(self.camera)
         angles = np.deg2rad([o.start_sigma_deg, o.common_sigma_deg, o.joint_sigma_deg])
         common = np.repeat([o.common_sigma_m, angles[1]], 3)
         joints = np.where(self.errors.joints.rotates, angles[2], o.joint_sigma_m)
@@ -343,7 +346,7 @@ class BundleAdjustment:
         root = estimate.root
         by_pose = [root[:, 6 * i : 6 * i + 6] for i in range(n)]
         shared = root[:, 6 * n :]
-        common = shared[:, :COMMON]
+        with_lens = np.r_[:COMMON, -INTRINSICS:0]
         systematic = systematic_covariance(
             self.frames.stated,
             self.errors,
@@ -365,9 +368,8 @@ class BundleAdjustment:
             sigma_m=float(variances.sigma[0]),
             sigma_rad=float(variances.sigma[3]),
             residual_px=float(np.median(residual_px)),
-            common_covariance=common.T @ common,
-            common_by_lens=_by_lens(common, root[:, -INTRINSICS:]),
-            common_systematic=systematic[:COMMON, :COMMON],
+            lens_covariance=shared[:, with_lens].T @ shared[:, with_lens],
+            lens_systematic=systematic[np.ix_(with_lens, with_lens)],
             correction=self.errors.of_cameras(parameters),
             errors=self.errors.at_origin(parameters),
             weight=np.minimum(variances.weight, 1.0),
@@ -378,15 +380,6 @@ class BundleAdjustment:
             offsets_prior=np.sqrt(prior),
             offsets_known=1 / information < DETERMINED * first_prior,
         )
-
-
-def _by_lens(common: Array, intrinsics: Array) -> Array:
-    """(6, 6) covariance of the common transform that known intrinsics would take away.
-
-    Both are columns of the factor of the covariance.
-    """
-    explained = np.linalg.solve(intrinsics.T @ intrinsics, intrinsics.T @ common)
-    return common.T @ intrinsics @ explained
 
 
 def _small_motion(tangent: Array) -> SE3:

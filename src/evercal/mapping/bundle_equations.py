@@ -14,8 +14,10 @@ COMMON = 6
 """Shared parameters of the common transform."""
 SHIFT = 1
 """Shared parameters of the time shift."""
-INTRINSICS = 5
-"""Intrinsics: logarithm of the focal length, principal point in pixels, k1, k2."""
+DISTORTION = 5
+"""Distortion coefficients that can be adjusted: k1 k2 p1 p2 k3, or k1 k2 k3 k4 of a fisheye."""
+INTRINSICS = 3 + DISTORTION
+"""Intrinsics: logarithm of the focal length, principal point in pixels, distortion."""
 SHARED = COMMON + SHIFT + INTRINSICS
 """Shared parameters in this order. Offsets of an arm's joints come before the intrinsics."""
 MIN_DEPTH = 0.05
@@ -23,7 +25,7 @@ MIN_DEPTH = 0.05
 MIN_DEPTH_SUM = 1e-6
 """Added to the information on each inverse depth, so that no division is by zero."""
 MIN_DISTORTION = 1e-4
-"""Smaller changes of k1 and k2 are ignored."""
+"""Smaller changes of all distortion coefficients are ignored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,7 @@ class Parameters:
     correction: Array
     """(n, 6) motion of each frame from its stated pose, camera frame, metres and radians."""
     shared: Array
-    """(12 + k,) see `SHARED`."""
+    """(15 + k,) see `SHARED`."""
     inverse_depth: Array
     """(p,) per metre."""
 
@@ -81,7 +83,7 @@ class Linearised:
     by_depth: Array
     """(m, 2) by the inverse depth."""
     by_intrinsics: Array
-    """(m, 2, 5)."""
+    """(m, 2, 8)."""
     valid: BoolArray
     """(m,) False where the distortion of the camera has no pixel for the landmark."""
 
@@ -143,7 +145,9 @@ class StatedFrames:
         by_camera = np.zeros((len(j), 2, INTRINSICS))
         for camera, rows in self._by_camera(parameters, j):
             pixel[rows] = camera.project(point[rows])
-            by_plane[rows], by_camera[rows] = camera.slopes(plane[rows])
+            by_plane[rows], by_camera[rows] = camera.slopes(
+                plane[rows], DISTORTION
+            )
         to_plane = np.zeros((len(j), 2, 3))
         to_plane[:, 0, 0] = to_plane[:, 1, 1] = 1 / point[:, 2]
         to_plane[:, :, 2] = -plane / point[:, 2:]
@@ -173,13 +177,13 @@ class StatedFrames:
     def _rays(
         self, tracks: BundleTracks, parameters: Parameters
     ) -> tuple[Array, Array]:
-        """Rays (m, 3) of the observed landmarks in their hosts, and derivatives (m, 2, 5)."""
+        """Rays (m, 3) of the observed landmarks in their hosts, and derivatives (m, 2, 8)."""
         ray = np.zeros((len(tracks.host), 3))
         slope = np.zeros((len(tracks.host), 2, INTRINSICS))
         for camera, rows in self._by_camera(parameters, tracks.host):
             ray[rows] = camera.unproject(tracks.pixels[rows])
             # A pixel is fixed: its ray moves against the change of the projection.
-            by_plane, by_camera = camera.slopes(ray[rows, :2])
+            by_plane, by_camera = camera.slopes(ray[rows, :2], DISTORTION)
             slope[rows] = -np.linalg.solve(by_plane, by_camera)
         return ray[tracks.landmark], slope[tracks.landmark]
 
@@ -206,7 +210,7 @@ class Solution:
     """One step."""
 
     change: Array
-    """(6 n + 12 + k,) of corrections and shared parameters."""
+    """(6 n + 15 + k,) of corrections and shared parameters."""
     depths: Array
     """(p,) of the inverse depths."""
     root: Array
@@ -228,17 +232,17 @@ class HostBlock(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Least squares in corrections and shared parameters (6 n + 12 + k) and inverse depths (p)."""
+    """Least squares in corrections and shared parameters (6 n + 15 + k) and inverse depths (p)."""
 
     gram: Array
-    """(6 n + 12 + k, 6 n + 12 + k) of the observations."""
+    """(6 n + 15 + k, 6 n + 15 + k) of the observations."""
     prior: Array
-    """(6 n + 12 + k, 6 n + 12 + k) of the priors."""
+    """(6 n + 15 + k, 6 n + 15 + k) of the priors."""
     blocks: list[HostBlock]
     depth: Array
     """(p,) diagonal of the inverse depths."""
     slope: Array
-    """(6 n + 12 + k,) half the gradient of the cost."""
+    """(6 n + 15 + k,) half the gradient of the cost."""
     depth_slope: Array
     """(p,) the same by inverse depths."""
 

@@ -2,8 +2,16 @@
 
 from dataclasses import dataclass
 
-from evercal.errors import require_numbers
+import numpy as np
 
+from evercal.errors import require_numbers
+from evercal.geometry import Camera
+from evercal.geometry.camera import USUAL_DISTORTION
+from evercal.mapping.bundle_equations import INTRINSICS
+from evercal.typing import Array
+
+FIXED = 1e-9
+"""Prior standard deviation of shared parameters that are not adjusted."""
 _MAY_BE_ZERO = ("relevance", "least_share", "least_systematic")
 """Lower bounds that have no effect at 0."""
 _LEAST = 1e-12
@@ -47,6 +55,10 @@ class BundleOptions:
     """Prior standard deviation of the principal point, pixels."""
     distortion_sigma: float = 0.2
     """Prior standard deviation of k1 and k2 where the recording states no distortion."""
+    lens_sigma: tuple[float, float] | None = None
+    """Prior standard deviations of an uncertain lens, which stay whatever the images say: of the
+    focal length and of the principal point, as shares of the focal length. The distortion is then
+    that of an unknown lens. None: intrinsics change only where the images require it."""
     relevance: float = 4.0
     """A group of parameters is adjusted when its squares are this many times their variance."""
     least_share: float = 1e-6
@@ -67,7 +79,23 @@ class BundleOptions:
         Raises:
             InputError: Fewer than one iteration, a negative number or zero.
         """
-        flags = {"common_stated", "intrinsics"}
+        others = {"common_stated", "intrinsics", "lens_sigma", *_MAY_BE_ZERO}
         require_numbers(self, ("iterations",), 1)
         require_numbers(self, _MAY_BE_ZERO, 0)
-        require_numbers(self, vars(self).keys() - flags - {*_MAY_BE_ZERO}, _LEAST)
+        require_numbers(self, vars(self).keys() - others, _LEAST)
+
+    def intrinsics_sigma(self, camera: Camera) -> Array:
+        """Prior standard deviations (8,) of the intrinsics, in the order of `Camera.slopes`."""
+        sigma = np.full(INTRINSICS, FIXED)
+        if self.lens_sigma is None:
+            sigma[0] = self.focal_sigma
+            sigma[1:3] = self.centre_sigma_px
+            if not any(camera.distortion):
+                sigma[3:5] = self.distortion_sigma
+            return sigma
+        focal, centre = self.lens_sigma
+        sigma[0] = focal
+        sigma[1:3] = centre * camera.fx
+        terms = USUAL_DISTORTION[camera.model]
+        sigma[3 : 3 + len(terms)] = terms
+        return sigma

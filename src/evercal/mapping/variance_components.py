@@ -18,8 +18,10 @@ from evercal.typing import Array
 
 _COMMON_GROUPS = (slice(0, 3), slice(3, 6))
 """Common translation and rotation: shared parameters that are relevant or not together."""
-_OTHER_GROUPS = (slice(6, 7), slice(-5, -4), slice(-4, -2), slice(-2, None))
-"""The same: time shift, focal length, principal point, distortion."""
+_SHIFT_GROUP = slice(6, 7)
+"""The same: time shift."""
+_LENS_GROUPS = (slice(-8, -7), slice(-7, -5), slice(-5, -3), slice(-3, None))
+"""The same: focal length, principal point, distortion, and terms that `lens_sigma` alone frees."""
 MIN_NOISE = 0.02
 """Lower bound of the standard deviation of whitened residuals."""
 MEDIAN_LENGTH = 1.177
@@ -116,21 +118,23 @@ def shared_variances(
     joints: slice,
     options: BundleOptions,
 ) -> Array:
-    """Prior variances (12 + k,) of the shared parameters.
+    """Prior variances (15 + k,) of the shared parameters.
 
     Args:
-        values: (12 + k,) estimates d.
-        rows: (r, 12 + k) factor of their posterior covariance, rows.T @ rows.
-        prior: (12 + k,) their prior variances s^2.
-        widest: (12 + k,) their first prior variances.
+        values: (15 + k,) estimates d.
+        rows: (r, 15 + k) factor of their posterior covariance, rows.T @ rows.
+        prior: (15 + k,) their prior variances s^2.
+        widest: (15 + k,) their first prior variances.
         joints: Parameters that are offsets of joints.
         options: Bounds.
     """
     posterior = np.einsum("ij,ij->j", rows, rows)
     variances = prior.copy()
-    groups = _OTHER_GROUPS
+    groups = [_SHIFT_GROUP]
     if options.common_stated:
-        groups = _COMMON_GROUPS + groups
+        groups += _COMMON_GROUPS
+    if options.lens_sigma is None:
+        groups += _LENS_GROUPS
     for group in groups:
         variances[group] = group_variance(
             values[group],
@@ -194,7 +198,7 @@ def systematic_covariance(
     variances: Variances,
     least: float,
 ) -> Array:
-    """Covariance of common transform, time shift and joints by systematic errors of poses.
+    """Covariance of the shared parameters by systematic errors of poses.
 
     The errors of an arm's joints vary slowly with the pose. They are modelled by errors that are
     linear in the rotation and position of a frame. Their variance t^2 is estimated from the
@@ -222,8 +226,8 @@ def systematic_covariance(
             residual[:, axes] ** 2 - k
         ).sum() + SYSTEMATIC_WEIGHT * SYSTEMATIC_VARIANCE
         ratio[axes] = max(excess / ((k**2).sum() + SYSTEMATIC_WEIGHT), least)
-    # Response of the shared parameters to an error of each stated pose: (7 + k, n, 6).
-    covariance = root[:, 6 * errors.n :][:, errors.moving].T @ root
+    # Response of the shared parameters to an error of each stated pose: (15 + k, n, 6).
+    covariance = root[:, 6 * errors.n :].T @ root
     response = weight * errors.of_rows(covariance) / variances.sigma
     scaled = np.einsum("kni,nr->kri", response, basis) * np.sqrt(HIDDEN * ratio)
     rows = scaled.reshape(len(scaled), -1)

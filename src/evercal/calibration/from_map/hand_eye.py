@@ -119,10 +119,6 @@ def hand_eye_of(
     )
     estimate = start.parent_from_camera @ start_from_camera
     start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.parent_from_camera)
-    given_mm = None
-    given_deg = None
-    if given is not None:
-        given_mm, given_deg = pose_distance_mm_deg(estimate.pose, given)
     terms = (
         ErrorTerm.of("noise of images and gripper poses", correction.by_noise),
         ErrorTerm.of("intrinsics", correction.by_lens),
@@ -134,6 +130,10 @@ def hand_eye_of(
         estimate.covariance,
         parent_frame=start.mount.parent,
         camera=built.scene.adjusted_camera,
+        lenses={
+            "stated": built.scene.camera,
+            "estimated": built.scene.adjusted_camera,
+        },
         images=_uses(frames, built),
         error_terms=terms,
         source={
@@ -144,6 +144,12 @@ def hand_eye_of(
         },
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
+    calibration = calibration.for_lens("stated")
+    given_mm = None
+    given_deg = None
+    if given is not None:
+        stated = calibration.parent_from_child
+        given_mm, given_deg = pose_distance_mm_deg(stated, given)
     if correction.arm is not None:
         calibration = _with_joints(calibration, correction.arm, frames)
     warnings = _warnings(built.adjusted)

@@ -65,9 +65,8 @@ def with_image_scatter(
     if len(base_from_camera) < 2:
         return estimate
     calibration = estimate.calibration
-    deviation = deviations(
-        SE3.stack(base_from_camera), estimate.parent_from_camera.pose
-    )
+    in_map = calibration.for_lens("estimated").parent_from_child
+    deviation = deviations(SE3.stack(base_from_camera), in_map)
     scatter = deviation.T @ deviation / len(deviation)
     checks = LearnedChecks(
         images_used=len(deviation),
