@@ -96,7 +96,8 @@ def learned_mount(
     """Learn a wrist recording and compare its `gripper_from_camera` with the true one."""
     report = Map.open(store).learn(recording)
     assert report.hand_eye is not None
-    return pose_error(report.hand_eye.parent_from_camera, truth), report
+    calibration = report.hand_eye.calibration.for_lens("stated")
+    return pose_error(calibration.uncertain_pose, truth), report
 
 
 def _wrist_draw(scene: Recording, room: Path, store: Path, draw: int) -> Row:
@@ -108,6 +109,7 @@ def _wrist_draw(scene: Recording, room: Path, store: Path, draw: int) -> Row:
     if folder.is_dir():
         images, true_camera = fixed_images(folder)
         calibration = calibrate(Localizer.open(store), images)
+        calibration = calibration.for_lens("stated")
         error = pose_error(calibration.uncertain_pose, true_camera)
         row |= {f"fixed_{key}": value for key, value in error.items()}
     return {"room": room.name, "draw": draw, **row}

@@ -125,7 +125,8 @@ def test_a_report_written_before_version_0_2_gives_the_same_calibration(
     folder, report = learned
     _, camera, stored = stored_scenes(folder)[0]
     del stored["calibration"]
-    expected = Map.open(folder).calibration()
+    # Such a report does not hold the stated intrinsics.
+    expected = replace(Map.open(folder).calibration(), lenses={})
     again = _of_version_0_1(stored)
     assert replace(again, camera=camera).to_dict() == expected.to_dict()
     assert json.loads(json.dumps(report.to_dict())) == stored

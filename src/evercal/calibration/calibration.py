@@ -4,24 +4,25 @@
      "parent_frame": "base", "child_frame": "camera",
      "meaning": "pose of camera in base: takes points from camera to base",
      "translation_m": [3], "quaternion_wxyz": [4], "matrix": [4][4],
-     "covariance": [6][6], "sigma_mm": x, "sigma_deg": x, "camera": {...}, "lens": "stated",
-     "lenses": {"stated": {...}, "estimated": {...}}, "images": [...],
+     "covariance": [6][6], "sigma_mm": x, "sigma_deg": x, "camera": {...},
+     "lens": "estimated", "lenses": {"stated": {...}, "estimated": {...}},
+     "for_stated_lens": {"matrix": [4][4], ...}, "stated_left_deg": x, "images": [...],
      "error_terms": [...], "checks": {...}, "joints": [...], "joint_covariance": [k][k],
      "verdict": "...", "source": {...}, "created": "..."}
 
 Metres, radians, quaternions w, x, y, z, OpenCV camera axes. The pose belongs to `camera`, which is
-the one of `lenses` that `lens` names. `matrix`, `meaning`, `lens` and the sigmas repeat other
-values for their readers.
+the one of `lenses` that `lens` names. `matrix`, `meaning`, `lens`, `for_stated_lens` and the sigmas
+repeat other values for their readers.
 """
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Self, get_args
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, get_args
 
 import numpy as np
 
-from evercal.calibration.checks import Checks, checks_of
+from evercal.calibration.checks import checks_of
 from evercal.calibration.framed_pose import FramedPose
 from evercal.calibration.framed_pose import ImageUse as ImageUse
 from evercal.calibration.framed_pose import JointOffset as JointOffset
@@ -33,6 +34,9 @@ from evercal.robot.mount import MountName, mount_named
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
 from evercal.typing import Array, PathLike
+
+if TYPE_CHECKING:
+    from evercal.calibration.comparison import Comparison
 
 FORMAT = "evercal-calibration"
 VERSION = 1
@@ -77,12 +81,8 @@ class Calibration(FramedPose):
 
     error_terms: tuple[ErrorTerm, ...] = ()
     """Parts of the covariance by cause; from images, those of `CovarianceTerm` and the scatter."""
-    checks: Checks = field(default_factory=Checks)
-    """What it was compared with: `ImageChecks`, `PairChecks` or `LearnedChecks`, by its origin."""
     verdict: str = ""
     """Uses that it serves, one or two sentences."""
-    source: Mapping[str, Any] = field(default_factory=dict)
-    """Command, store, scene and options, JSON values."""
     created: str = ""
     """ISO 8601 time with zone."""
 
@@ -154,8 +154,8 @@ class Calibration(FramedPose):
             **self.transform_to_dict(),
             "sigma_mm": self.sigma_mm,
             "sigma_deg": self.sigma_deg,
-            "camera": None if self.camera is None else self.camera.to_dict(),
-            "lens": self.lens,
+            "for_stated_lens": self.for_program().transform_to_dict(),
+            "stated_left_deg": float(np.rad2deg(self.stated_left_rad)),
             "lenses": {name: own.to_dict() for name, own in self.lenses.items()},
             "images": [vars(image) for image in self.images],
             "error_terms": [vars(term) for term in self.error_terms],
@@ -212,6 +212,17 @@ class Calibration(FramedPose):
     def write(self, path: PathLike) -> None:
         """Write the file atomically."""
         write_json(path, self.to_dict())
+
+    def distance(self, other: Self, distance_m: float | None = None) -> "Comparison":
+        """Compare with another calibration of this camera, and judge whether both agree.
+
+        Args:
+            other: The other one, in the same frames.
+            distance_m: Working distance. Default: that of the board, or 0.5 m.
+        """
+        from evercal.calibration.comparison import compare
+
+        return compare(self, other, distance_m)
 
     def export(
         self, format: ExportFormat | str, path: PathLike | None = None, **options: Any

@@ -12,6 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evercal.calibration.calibration import Calibration, ImageUse
+from evercal.calibration.comparison import (
+    SAME_MAP,
+    pooled_scatter,
+    same_map_covariance,
+)
 from evercal.calibration.held_thing.held_again import LEAST_GRIPS, held_again
 from evercal.calibration.located import (
     Fused,
@@ -38,12 +43,6 @@ _LEAST_MM = 0.7
 """Smaller shifts, millimetres, are no move."""
 _LEAST_DEG = 0.04
 """Smaller rotations, degrees, are no move."""
-_FLOOR = np.repeat([0.2e-3, np.deg2rad(0.008)], 3)
-"""Standard deviation per axis from changes of light and objects, metres and radians."""
-_USUAL_SCATTER = np.repeat([0.4e-3, np.deg2rad(0.01)], 3)
-"""Prior scatter of a single image per axis, metres and radians."""
-_USUAL_WEIGHT = 5.0
-"""Weight of the prior scatter, in images."""
 _CAMERA_OR_GRIP = (
     f"The camera, or the thing in the gripper: {LEAST_GRIPS} images that turn it about two axes"
     " show which of them moved."
@@ -112,19 +111,17 @@ def shift_between(
     scene = localizer.contents.metric_scene(fused.scene)
     same = reference.source.get("map") == scene.digest
     count = int(fused.used.sum())
-    floor = np.diag(_FLOOR**2)
     measured = [(fused.scatter, count)]
     if same:
         # One camera in one map: the scatter of its images is the same before and now.
         before = int(reference.checks.images_used or 1)
         stated = reference.checks.image_scatter or np.zeros((6, 6))
         measured.append((np.array(stated), before))
-        scatter = _scatter(measured)
-        covariance = scatter / count + scatter / before + floor
+        covariance = same_map_covariance(measured)
         if scene.parent_frame == "gripper":
             covariance += mean_covariance(fused.select(located)) / count
     else:
-        covariance = _scatter(measured) / count + floor
+        covariance = pooled_scatter(measured) / count + SAME_MAP
         by_map = mean_covariance(fused.select(located))
         covariance = covariance + reference.covariance + by_map
     shift = shift_of(reference, fused.pose, covariance, confidence, fused.uses)
@@ -165,12 +162,3 @@ def shift_of(
         same_map=False,
         images=images,
     )
-
-
-def _scatter(measured: Sequence[tuple[Array, int]]) -> Array:
-    total = _USUAL_WEIGHT * np.diag(_USUAL_SCATTER**2)
-    weight = _USUAL_WEIGHT
-    for scatter, count in measured:
-        total = total + (count - 1) * scatter
-        weight = weight + count - 1
-    return total / weight

@@ -6,9 +6,9 @@ from typing import Any, Self
 
 import numpy as np
 
+from evercal.calibration.checks import Checks
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose
-from evercal.geometry.rays import fit_rays
 from evercal.robot.mount import MountName, mount_named
 from evercal.typing import Array
 
@@ -73,6 +73,11 @@ class FramedPose:
     lenses: Mapping[str, Camera] = field(default_factory=dict, kw_only=True)
     """Intrinsics of this camera by their origin: `stated` with the images, and `estimated`."""
 
+    checks: Checks = field(default_factory=Checks, kw_only=True)
+    """What it was compared with: `ImageChecks`, `PairChecks` or `LearnedChecks`, by its origin."""
+    source: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
+    """Command, store, scene and options, JSON values."""
+
     @property
     def on_gripper(self) -> bool:
         """Whether the gripper carries the camera; otherwise it stands still in the base."""
@@ -96,15 +101,30 @@ class FramedPose:
         return next((k for k, own in self.lenses.items() if own == self.camera), "")
 
     @property
-    def lens_left_rad(self) -> float:
-        """Angle by which rays leave the estimated ones: root mean square over the image's middle.
+    def lens_in_words(self) -> str:
+        """The intrinsics that the pose belongs to; empty without any."""
+        own = self.camera
+        if own is None:
+            return ""
+        numbers = f"fx {own.fx:.3f} fy {own.fy:.3f} cx {own.cx:.3f} cy {own.cy:.3f} px"
+        if own.distortion:
+            terms = " ".join(map("{:.6g}".format, own.distortion))
+            numbers = f"{numbers}, distortion {terms}"
+        return f"the {self.lens} intrinsics {numbers}".replace("  ", " ")
 
-        No pose takes it away, only the estimated intrinsics do.
+    @property
+    def stated_left_rad(self) -> float:
+        """Angle by which rays of the stated intrinsics leave the estimated ones, whatever the pose.
+
+        Root mean square over the middle of the image; 0 if nothing is stated or estimated.
         """
-        estimated = self.lenses.get("estimated")
-        if estimated is None or self.camera in (None, estimated):
+        cameras = [self.lenses.get(name) for name in ("stated", "estimated")]
+        stated, estimated = cameras
+        if stated is None or estimated is None or stated == estimated:
             return 0.0
-        left = fit_rays(estimated, self.camera).left_rad
+        from evercal.geometry.rays import fit_rays
+
+        left = fit_rays(estimated, stated).left_rad
         return float(np.sqrt((left**2).mean()))
 
     def for_lens(self, lens: Camera | str) -> Self:
@@ -116,6 +136,8 @@ class FramedPose:
         Raises:
             InputError: The calibration has no such intrinsics, or their images differ in size.
         """
+        from evercal.geometry.rays import fit_rays
+
         lenses = dict(self.lenses)
         if isinstance(lens, Camera):
             lenses["given"] = lens
@@ -129,7 +151,7 @@ class FramedPose:
         try:
             turn = fit_rays(self.camera, lens).own_from_other
         except ValueError as error:
-            raise InputError(f"`lens`: {error}") from None
+            raise InputError(str(error)) from None
         moved = self.uncertain_pose @ SE3.of(turn, np.zeros(3))
         return replace(
             self,
@@ -138,6 +160,12 @@ class FramedPose:
             camera=lens,
             lenses=lenses,
         )
+
+    def for_program(self) -> Self:
+        """The pose for the intrinsics that other programs use: the stated ones, if any."""
+        if "stated" in self.lenses:
+            return self.for_lens("stated")
+        return self
 
     def transform_to_dict(self) -> dict[str, Any]:
         """Return JSON values of the transform."""
@@ -149,4 +177,6 @@ class FramedPose:
             "quaternion_wxyz": self.parent_from_child.rotation_wxyz.tolist(),
             "matrix": self.parent_from_child.matrix().tolist(),
             "covariance": self.covariance.tolist(),
+            "lens": self.lens,
+            "camera": None if self.camera is None else self.camera.to_dict(),
         }

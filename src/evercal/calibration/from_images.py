@@ -34,6 +34,7 @@ from evercal.calibration.verdict import verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, deviations
 from evercal.geometry.camera import COEFFICIENTS
+from evercal.geometry.rays import fit_rays
 from evercal.localization.intrinsics import STATED, cameras_in_scenes
 from evercal.recordings.images import pixels_of
 from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount, MountName, mount_named
@@ -78,11 +79,7 @@ def calibrate(
 
     `mount` is eye_in_hand by default if there are gripper poses and the camera moves.
     """
-    stated_mount = None if mount is None else mount_named(mount)
-    if stated_mount == EYE_IN_HAND and given.base_from_gripper is None:
-        raise InputError(
-            "eye_in_hand needs the gripper's pose at every image: give `robot_poses`"
-        )
+    stated_mount = _stated_mount(mount, given)
     located = locate(localizer, given.images, given.camera, on_image)
     view = _view(localizer, given, located, stated_mount)
     fused = view.fused
@@ -94,13 +91,18 @@ def calibrate(
         "map": scene.digest,
         "intrinsics": "map" if given.camera is None else "given",
     }
+    height, width = first.shape[:2]
     stated = cameras_in_scenes(given.camera, first, [scene])[0]
     estimated = estimated_camera(fused.select(located), stated)
-    camera = estimated.resized(first.shape[1], first.shape[0])
+    lenses = {"estimated": estimated.resized(width, height)}
+    own = given.camera or scene.camera
+    if own.fits(width, height):
+        lenses["stated"] = own.resized(width, height)
     grip = None
     if view.held and given.base_from_gripper is not None:
         grip = held_again(located, given.base_from_gripper)
     if grip is not None:
+        camera = lenses["estimated"]
         return _held_thing_calibration(grip, view, camera, source)
     if view.parent_from_scene is None:
         uncertainty = from_one_spot(view.in_parent, fused)
@@ -117,15 +119,25 @@ def calibrate(
         parent_from_child=fused.pose,
         covariance=uncertainty.covariance,
         parent_frame=view.mount.parent,
-        camera=camera,
+        camera=stated.resized(width, height),
+        lenses=lenses,
         images=fused.uses,
         error_terms=uncertainty.terms,
         checks=_checks(view),
         source=source,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
-    )
+    ).for_lens("estimated")
     advice = _advice(calibration, fused, estimated, stated)
     return replace(calibration, verdict=" ".join([verdict(calibration), *advice]))
+
+
+def _stated_mount(mount: MountName | None, given: Images) -> Mount | None:
+    stated = None if mount is None else mount_named(mount)
+    if stated == EYE_IN_HAND and given.base_from_gripper is None:
+        raise InputError(
+            "eye_in_hand needs the gripper's pose at every image: give `robot_poses`"
+        )
+    return stated
 
 
 def _view(
@@ -199,13 +211,8 @@ def estimated_camera(used: Sequence[ImagePose], stated: Camera) -> Camera:
     fx, fy, cx, cy, *distortion = np.median(rows, axis=0).tolist()
     terms = tuple(distortion[: len(COEFFICIENTS[stated.model])])
     median = replace(stated, fx=fx, fy=fy, cx=cx, cy=cy, distortion=terms)
-    across = np.linspace(0, 1, 5)[:, None] * [stated.width - 1, stated.height - 1]
-    pixels = np.stack(np.meshgrid(*across.T), -1)
     # Compare angles between rays: the principal point trades against the rotation.
-    shift = median.unproject(pixels) - stated.unproject(pixels)
-    shift = (shift - np.nanmean(shift, (0, 1)))[..., :2]
-    largest = np.nanmax(np.linalg.norm(shift, axis=-1))
-    if stated.fx * largest > CONTRADICTED_PX:
+    if stated.fx * fit_rays(stated, median).left_rad.max() > CONTRADICTED_PX:
         return median
     return stated
 

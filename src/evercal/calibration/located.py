@@ -18,6 +18,8 @@ from evercal.geometry import (
     length_mm_deg,
     pose_distance_mm_deg,
 )
+from evercal.geometry.rays import fit_rays
+from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.localization.pictures import localize_picture
 from evercal.recordings.images import Picture
 from evercal.typing import Array, BoolArray
@@ -86,11 +88,24 @@ def locate(
     camera: Camera | None = None,
     on_image: Callable[[], object] = lambda: None,
 ) -> list[ImagePose]:
-    """Read and locate the named images one by one; `on_image` is called after each."""
+    """Read and locate the named images one by one; `on_image` is called after each.
+
+    Poses are for the intrinsics that are given, or those of the map: not for the ones that each
+    image estimates for itself.
+    """
     located = []
     for name, image in images:
         estimate = localize_picture(localizer, image, camera)
-        uncertain = estimate.uncertain_pose or UncertainPose(SE3.identity(), np.eye(6))
+        uncertain = estimate.uncertain_pose
+        own = estimate.camera
+        if uncertain is None:
+            uncertain = UncertainPose(SE3.identity(), np.eye(6))
+        elif own is not None and estimate.scene is not None:
+            shape = np.empty((own.height, own.width), np.uint8)
+            scene = localizer.contents.scene(estimate.scene)
+            common = cameras_in_scenes(camera, shape, [scene])[0]
+            turn = fit_rays(own, common).own_from_other
+            uncertain = uncertain @ SE3.of(turn, np.zeros(3))
         located.append(ImagePose(name, estimate, uncertain.pose, uncertain.covariance))
         on_image()
     return located

@@ -42,7 +42,7 @@ VERBS = {
         "align",
     ],
     "Boards and pose pairs": ["detect", "solve"],
-    "Results": ["export", "report"],
+    "Results": ["export", "report", "compare"],
     "Recordings": ["inspect", "convert", "reconstruct", "simulate", "demo"],
     "Networks": ["bench"],
 }

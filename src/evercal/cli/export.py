@@ -34,6 +34,9 @@ class Export(args.Verb):
     """Format, such as easy_handeye2, urdf, opencv or kuka; `list` lists all."""
     out: args.File = None
     """File to write; a new folder for colmap."""
+    lens: Annotated[Path | None, args.shown("stated|estimated|FILE")] = None
+    """Intrinsics of the program that takes the pose: those stated with the images, the estimated
+    ones, which are then written beside it, or a camera file. Default: the stated ones, if any."""
     parent: args.Frame = None
     """New name of the parent frame: the robot base or the gripper."""
     child: args.Frame = None
@@ -82,6 +85,8 @@ class Export(args.Verb):
         if self.calibration is None:
             raise InputError("no calibration given; name its JSON file after 'export'")
         options = {key: getattr(self, key) for key in ExportOptions.__annotations__}
+        if self.lens is not None:
+            options["lens"] = str(self.lens)
         calibration = calibration_at(self.calibration)
         exported = export_files(calibration, self.format, self.out, **options)
         self._show(exported, calibration.verdict)
@@ -98,6 +103,8 @@ class Export(args.Verb):
                 f" root frame with --via, because a tf frame has only one parent",
                 sys.stderr,
             )
+        if calibration.lens:
+            say(f"note: the pose is for {calibration.lens_in_words}", sys.stderr)
         if self.out is None and not self.json:
             sys.stdout.write(printable(exported.text))
             return
@@ -109,6 +116,8 @@ class Export(args.Verb):
             "meaning": calibration.meaning,
             "translation_m": pose.translation_m.tolist(),
             "quaternion_wxyz": pose.rotation_wxyz.tolist(),
+            "lens": calibration.lens,
+            "camera": calibration.camera and calibration.camera.to_dict(),
             "verdict": verdict,
             "files": files,
             "text": None if files else exported.text,

@@ -34,12 +34,6 @@ COEFFICIENTS: dict[str, tuple[str, ...]] = {
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
 """Names of the distortion coefficients of each model, in OpenCV's order."""
-USUAL_DISTORTION = {
-    "pinhole": (0.3, 0.5, 2e-3, 2e-3, 0.5),
-    "fisheye": (0.1,) * 4,
-}
-"""Standard deviations of the coefficients of an unknown lens. Files of real lenses err as much:
-many state no distortion."""
 _COEFFICIENT_COUNTS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
 """Allowed numbers of coefficients of each model."""
 _EXACT = 1e-10
@@ -162,11 +156,10 @@ class Camera:
     def changed(self, change: ArrayLike) -> "Camera":
         """The camera after a change (3 + k,) of the parameters of `slopes`."""
         log_focal, x, y, *more = np.asarray(change, np.float64).tolist()
-        terms = [*self.distortion, *(0.0,) * (len(more) - len(self.distortion))]
-        for i, term in enumerate(more):
-            terms[i] += term
-        least = _COEFFICIENT_COUNTS[self.model][1]
-        terms += [0.0] * (least - len(terms))
+        terms = np.array(self.coefficients)
+        terms[: len(more)] += more
+        count = max(4, len(more), len(self.distortion))
+        count = min(count, len(COEFFICIENTS[self.model]))
         factor = math.exp(log_focal)
         return replace(
             self,
@@ -174,7 +167,7 @@ class Camera:
             fy=factor * self.fy,
             cx=self.cx + x,
             cy=self.cy + y,
-            distortion=tuple(terms[: len(COEFFICIENTS[self.model])]),
+            distortion=tuple(terms[:count].tolist()),
         )
 
     def fits(self, width: int, height: int) -> bool:
@@ -296,11 +289,9 @@ class Camera:
             lens[:, 5] = lens[:, 4] * next_power
             lens[:, 6] = lens[:, 5] * next_power
         elif terms > 2:
-            lens[0, 5] = lens[1, 6] = 2 * x * y
-            lens[1, 5] = r2 + 2 * y * y
-            lens[0, 6] = r2 + 2 * x * x
-            lens[0, 5:7] *= self.fx
-            lens[1, 5:7] *= self.fy
+            cross = 2 * x * y
+            lens[0, 5:7] = self.fx * np.stack([cross, r2 + 2 * x * x])
+            lens[1, 5:7] = self.fy * np.stack([r2 + 2 * y * y, cross])
             lens[:, 7] = lens[:, 4] * next_power
         by_plane = np.moveaxis(by_plane, (0, 1), (-2, -1))
         return by_plane, np.moveaxis(lens, (0, 1), (-2, -1))

@@ -14,6 +14,12 @@ from evercal.typing import Array
 
 FISHEYE_DEG = 85.0
 """Largest angle to the optical axis of a ray of a fisheye."""
+USUAL_DISTORTION = {
+    "pinhole": (0.3, 0.5, 2e-3, 2e-3, 0.5),
+    "fisheye": (0.1,) * 4,
+}
+"""Standard deviations of the coefficients of an unknown lens. Files of real lenses err as much:
+many state no distortion."""
 
 
 def radial_pinhole(coefficients: tuple[float, ...], r2: Array) -> tuple[Array, Array]:

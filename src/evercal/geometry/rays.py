@@ -14,8 +14,6 @@ from evercal.typing import Array
 
 MIDDLE = 0.8
 """Share of width and height in which lenses are compared: few images measure the corners."""
-_GRID = (9, 7)
-"""Pixels of the comparison, right and down."""
 _STEP = 1e-4
 """Change of a parameter for a derivative, as a share of its unit."""
 
@@ -38,34 +36,32 @@ class RayFit(NamedTuple):
 
 def angles(a: Array, b: Array) -> Array:
     """Angles (m,) between unit vectors (m, 3), radians."""
-    return 2 * np.arcsin(np.minimum(np.linalg.norm(a - b, axis=-1) / 2, 1))
+    chord = np.linalg.norm(a - b, axis=-1)
+    return 2 * np.arcsin(np.minimum(chord / 2, 1))
 
 
 def fit_rays(own: Camera, other: Camera) -> RayFit:
     """Fit a rotation to the rays of the middle of the image.
 
     Raises:
-        ValueError: The images differ in size, or fewer than three pixels have a ray in both lenses.
+        ValueError: The images differ in size, or the distortion leaves no rays.
     """
-    if (own.width, own.height) != (other.width, other.height):
+    size = (own.width, own.height)
+    others = (other.width, other.height)
+    if size != others:
         raise ValueError(
-            f"intrinsics of {own.width}x{own.height} and of {other.width}x{other.height} pixels"
-            " have no common rays; give both for one image size"
+            f"the intrinsics are of {size} and of {others} pixels; give both for one image size"
         )
-    edge = (1 - MIDDLE) / 2
-    right = np.linspace(edge, 1 - edge, _GRID[0]) * own.width - 0.5
-    down = np.linspace(edge, 1 - edge, _GRID[1]) * own.height - 0.5
-    pixels = np.stack(np.meshgrid(right, down), -1).reshape(-1, 2)
-    first = own.unproject(pixels)
-    second = other.unproject(pixels)
-    valid = np.isfinite(first + second).all(1)
-    if valid.sum() < 3:
+    across = np.linspace((1 - MIDDLE) / 2, (1 + MIDDLE) / 2, 8)
+    pixels = np.stack(np.meshgrid(across, across), -1).reshape(-1, 2)
+    pixels = pixels * size - 0.5
+    rays = np.stack([own.unproject(pixels), other.unproject(pixels)])
+    rays = rays[:, np.isfinite(rays).all((0, 2))]
+    if rays.shape[1] < 3:
         raise ValueError("the distortion leaves no rays in the middle of the image")
-    first = first[valid] / np.linalg.norm(first[valid], axis=1, keepdims=True)
-    second = second[valid] / np.linalg.norm(second[valid], axis=1, keepdims=True)
-    u, _, v = np.linalg.svd(first.T @ second)
-    turn = Rotation.from_matrix(u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v)
-    return RayFit(turn, first, turn.apply(second))
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    turn = Rotation.align_vectors(rays[0], rays[1])[0]
+    return RayFit(turn, rays[0], turn.apply(rays[1]))
 
 
 def turn_by_lens(camera: Camera, terms: int) -> Array:
@@ -73,11 +69,10 @@ def turn_by_lens(camera: Camera, terms: int) -> Array:
 
     The pose for a lens whose intrinsics are off by d is the true one turned by this times d.
     """
-    units = np.array([1.0, camera.fx, camera.fy, *(1.0,) * terms])
+    units = np.ones(3 + terms)
+    units[1:3] = camera.fx
     columns = []
-    for i, unit in enumerate(_STEP * units):
-        change = np.zeros(len(units))
-        change[i] = unit
+    for change in np.diag(_STEP * units):
         turn = fit_rays(camera, camera.changed(change)).own_from_other
-        columns.append(turn.as_rotvec() / unit)
+        columns.append(turn.as_rotvec() / change.sum())
     return np.stack(columns, 1)

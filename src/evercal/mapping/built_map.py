@@ -7,7 +7,6 @@ from typing import Self
 import numpy as np
 
 from evercal.geometry import SE3, Camera
-from evercal.geometry.rays import turn_by_lens
 from evercal.mapping.arm_offsets import with_offsets
 from evercal.mapping.bundle_adjustment import Adjustment
 from evercal.mapping.bundle_equations import DISTORTION, INTRINSICS
@@ -132,6 +131,8 @@ def of_rays(
     Returns:
         Of noise, of the uncertainty of the intrinsics, and of errors that vary slowly.
     """
+    from evercal.geometry.rays import turn_by_lens
+
     turn = turn_by_lens(whole, DISTORTION)
     turn[:, 1:3] *= whole.fx / camera.fx
     rays = np.eye(6, 6 + INTRINSICS)

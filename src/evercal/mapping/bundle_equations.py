@@ -145,9 +145,7 @@ class StatedFrames:
         by_camera = np.zeros((len(j), 2, INTRINSICS))
         for camera, rows in self._by_camera(parameters, j):
             pixel[rows] = camera.project(point[rows])
-            by_plane[rows], by_camera[rows] = camera.slopes(
-                plane[rows], DISTORTION
-            )
+            by_plane[rows], by_camera[rows] = camera.slopes(plane[rows], DISTORTION)
         to_plane = np.zeros((len(j), 2, 3))
         to_plane[:, 0, 0] = to_plane[:, 1, 1] = 1 / point[:, 2]
         to_plane[:, :, 2] = -plane / point[:, 2:]

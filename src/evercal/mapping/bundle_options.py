@@ -6,7 +6,7 @@ import numpy as np
 
 from evercal.errors import require_numbers
 from evercal.geometry import Camera
-from evercal.geometry.camera import USUAL_DISTORTION
+from evercal.geometry.distortion import USUAL_DISTORTION
 from evercal.mapping.bundle_equations import INTRINSICS
 from evercal.typing import Array
 

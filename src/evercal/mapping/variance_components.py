@@ -11,7 +11,7 @@ what the images say: y = d / K has the variance s^2 + v / K.
 import numpy as np
 
 from evercal.geometry import SE3
-from evercal.mapping.bundle_equations import Linearised, Parameters
+from evercal.mapping.bundle_equations import INTRINSICS, Linearised, Parameters
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.stated_errors import StatedErrors, Variances
 from evercal.typing import Array
@@ -40,6 +40,10 @@ VARIANCE_SHRINKAGE = 16
 """Largest divisor of the variance of shared parameters in one iteration."""
 USUAL_OFFSET = 0.05 / 3
 """Prior of the offsets: one pseudo-joint with this offset, in sigmas of the first prior."""
+USUAL_LENS = 0.2
+"""The same of the intrinsics."""
+MOST_LENS = 16.0
+"""Largest variance of the intrinsics, in first priors: a wrong file is off by several sigma."""
 SYSTEMATIC_WEIGHT = 1.0
 """Weight of the prior of the variance of systematic errors, in directions that the images observe
 fully."""
@@ -143,10 +147,20 @@ def shared_variances(
             widest[group],
             options,
         )
+    alike = []
+    if options.lens_sigma is not None:
+        alike.append((slice(-INTRINSICS, None), USUAL_LENS, MOST_LENS))
     if joints.stop > joints.start:
-        variances[joints] = joint_variance(
-            values[joints], posterior[joints], prior[joints], widest[joints]
+        alike.append((joints, USUAL_OFFSET, 1.0))
+    for group, usual, most in alike:
+        share = common_share(
+            values[group],
+            posterior[group],
+            prior[group],
+            widest[group],
+            usual,
         )
+        variances[group] = min(share, most) * widest[group]
     return variances
 
 
@@ -172,22 +186,22 @@ def group_variance(
     return np.maximum(variance, options.least_share * widest)
 
 
-def joint_variance(
+def common_share(
     values: Array,
     posterior: Array,
     prior: Array,
     widest: Array,
-) -> Array:
-    """Prior variances (k,) of the offsets of an arm's joints: one share of `widest` for all.
+    usual: float,
+) -> float:
+    """Share of `widest` (k,) that is the variance of k parameters which are good or bad together.
 
-    The sum of d^2 over the sum of K, both with the pseudo-joint of `USUAL_OFFSET`. So an offset
-    that no image constrains is as large as the others.
+    The sum of d^2 over the sum of K, both with a pseudo-parameter of the size `usual`. So a joint
+    or a term of the lens that no image constrains is as large as the others.
     """
     constrained = (1 - posterior / prior).clip(0).sum()
-    squares = float((values**2 / widest).sum()) + USUAL_OFFSET**2
-    share = min(squares / (constrained + 1), 1.0)
+    squares = float((values**2 / widest).sum()) + usual**2
     before = float((prior / widest)[0])
-    return max(share, before / VARIANCE_SHRINKAGE) * widest
+    return max(squares / (constrained + 1), before / VARIANCE_SHRINKAGE)
 
 
 def systematic_covariance(

@@ -17,6 +17,8 @@ from evercal.typing import PathLike
 
 Content: TypeAlias = str | bytes | dict[str, str]
 """Text, bytes, or the texts of a folder by file name."""
+_HOLD_INTRINSICS = ("camera_info", "opencv", "colmap", "nerfstudio")
+"""Formats that hold the intrinsics which their pose is for."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,8 @@ def export_files(
     Args:
         calibration: Calibration to export.
         format: Name of a format in `FORMATS`; hyphens count as underscores.
-        path: File to write, or a new folder for COLMAP. If omitted, nothing is written.
+        path: File to write, or a new folder for COLMAP. If omitted, nothing is written. Beside a
+            pose for the estimated intrinsics these are written, too, as camera_info.
         options: Frame names and further inputs, see `ExportOptions`.
     """
     key = format.strip().lower().replace("-", "_")
@@ -160,6 +163,10 @@ def export_files(
     text = content if isinstance(content, str) else ""
     if path is not None:
         files = _write(Path(path), content)
+        estimated = export.calibration.lens == "estimated"
+        if estimated and key not in _HOLD_INTRINSICS:
+            beside = Path(path).with_suffix(".camera_info.yaml")
+            files += _write(beside, to.camera_info(export))
         return Exported(exporter, export.calibration, text, files)
     if not text:
         raise InputError(f"{key} is not text and cannot be printed; give `out`")

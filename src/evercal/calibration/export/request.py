@@ -17,6 +17,7 @@ from evercal.calibration.framed_pose import FramedPose
 from evercal.choices import Motors
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
+from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.poses.conventions import numbers_from_poses, pose_convention
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.storage.text_files import read_text, yaml_documents
@@ -32,6 +33,9 @@ _FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(/[A-Za-z0-9_.\-]+)*")
 class ExportOptions(TypedDict, total=False):
     """Options of an export; all may be omitted."""
 
+    lens: Camera | PathLike | None
+    """Intrinsics that the programs use which take the pose: `stated` or `estimated`, see
+    `FramedPose.lenses`, or a camera file. Default: the stated ones, where there are such."""
     parent: str | None
     """New name of the parent frame."""
     child: str | None
@@ -111,7 +115,10 @@ class Export:
     @property
     def comment(self) -> str:
         """Meaning of the numbers; the frame names in it are safe in any file."""
-        return f"{self.calibration.meaning}. Written by evercal."
+        lens = self.calibration.lens_in_words
+        if lens:
+            lens = f" For {lens}."
+        return f"{self.calibration.meaning}.{lens} Written by evercal."
 
     def numbers(self, convention: str = "xyzw") -> list[float]:
         """The pose as numbers of a convention."""
@@ -127,7 +134,8 @@ def pose_numbers(poses: SE3, convention: str = "xyzw") -> Array:
 def prepare_export(
     calibration: FramedPose, name: str = "evercal", **options: Unpack[ExportOptions]
 ) -> Export:
-    """Rename the frames, move the pose to the driver's root frame, and read the files."""
+    """Turn the pose for the intrinsics, rename and move its frames, and read the files."""
+    calibration = _for_lens(calibration, options.get("lens"))
     parent = options.get("parent") or calibration.parent_frame
     child = options.get("child") or calibration.child_frame
     link = options.get("via")
@@ -159,6 +167,15 @@ def prepare_export(
     if target is not None and not isinstance(target, RobotPoses):
         target = read_robot_poses(target, what="file of target poses", option=None)
     return Export(calibration, name, other, robot, target, options)
+
+
+def _for_lens(calibration: FramedPose, lens: Camera | PathLike | None) -> FramedPose:
+    if lens is None:
+        return calibration.for_program()
+    if isinstance(lens, Camera) or lens in ("stated", "estimated"):
+        return calibration.for_lens(lens)
+    own = calibration.camera
+    return calibration.for_lens(read_camera(lens, own and (own.width, own.height)))
 
 
 def _link_from_optical(optical: str, options: ExportOptions) -> SE3:

@@ -144,7 +144,7 @@ def easy_handeye2(export: Export) -> str:
         **_MOVE_GROUP,
     }
     message = {"parameters": parameters, "transform": _transform(export)}
-    return _yaml(message)
+    return f"# {export.comment}\n" + _yaml(message)
 
 
 def easy_handeye(export: Export) -> str:
@@ -158,7 +158,7 @@ def easy_handeye(export: Export) -> str:
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")
     transformation = dict(zip(names, export.numbers(), strict=True))
     calibration = {"parameters": parameters, "transformation": transformation}
-    return _yaml(calibration)
+    return f"# {export.comment}\n" + _yaml(calibration)
 
 
 def camera_info(export: Export) -> str:
@@ -220,7 +220,8 @@ def opencv(export: Export) -> str:
     )
     storage = cv2.FileStorage(".yml", mode)
     storage.writeComment(
-        f"rvec, tvec take points from {export.parent} to {export.child}, metres"
+        f"rvec, tvec take points from {export.parent} to {export.child}, metres;"
+        f" {export.comment}"
     )
     storage.write("rvec", rotation.as_rotvec().reshape(3, 1))
     storage.write("tvec", camera_from_parent.translation_m.reshape(3, 1))

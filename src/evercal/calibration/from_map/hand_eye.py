@@ -144,12 +144,6 @@ def hand_eye_of(
         },
         created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-    calibration = calibration.for_lens("stated")
-    given_mm = None
-    given_deg = None
-    if given is not None:
-        stated = calibration.parent_from_child
-        given_mm, given_deg = pose_distance_mm_deg(stated, given)
     if correction.arm is not None:
         calibration = _with_joints(calibration, correction.arm, frames)
     warnings = _warnings(built.adjusted)
@@ -162,11 +156,20 @@ def hand_eye_of(
         start.of_pairs,
         start_mm,
         start_deg,
-        given_mm,
-        given_deg,
+        *_from_given(calibration, given),
         warnings,
         advice,
     )
+
+
+def _from_given(
+    calibration: Calibration, given: SE3 | None
+) -> tuple[float, float] | tuple[None, None]:
+    """Distance from a given transform, which is taken to be for the stated intrinsics."""
+    if given is None:
+        return None, None
+    stated = calibration.for_lens("stated")
+    return pose_distance_mm_deg(stated.parent_from_child, given)
 
 
 def verdict_of(calibration: Calibration, warnings: Sequence[str], advice: str) -> str:

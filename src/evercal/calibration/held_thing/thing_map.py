@@ -65,8 +65,9 @@ def with_image_scatter(
     if len(base_from_camera) < 2:
         return estimate
     calibration = estimate.calibration
-    in_map = calibration.for_lens("estimated").parent_from_child
-    deviation = deviations(SE3.stack(base_from_camera), in_map)
+    deviation = deviations(
+        SE3.stack(base_from_camera), estimate.parent_from_camera.pose
+    )
     scatter = deviation.T @ deviation / len(deviation)
     checks = LearnedChecks(
         images_used=len(deviation),

@@ -63,7 +63,9 @@ def camera_from_fields(data: Fields, size: Size | None = None) -> Camera:
     `size` is (width, height) in pixels of the images, if the fields may lack it. ValueError: the
     fields are no camera or several, or the images are distorted otherwise or cut out.
     """
-    entries = [*_entries(_undotted(data), {}, "")]
+    # A calibration also holds the intrinsics that were stated.
+    own = {key: value for key, value in data.items() if key != "lenses"}
+    entries = [*_entries(_undotted(own), {}, "")]
     if not entries:
         return camera_of(data, size)
     cameras: dict[str, Camera] = {}
