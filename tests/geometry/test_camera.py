@@ -110,9 +110,10 @@ def test_slopes_equal_finite_differences(
         return camera.project(np.concatenate([plane + move, np.ones((20, 1))], 1))
 
     def changed(size: float) -> list[Camera]:
-        return [camera.changed(row) for row in size * np.eye(5)]
+        return [camera.changed(row) for row in size * np.eye(8)]
 
-    by_plane, by_lens = camera.slopes(plane)
+    by_plane, by_lens = camera.slopes(plane, 5)
+    np.testing.assert_array_equal(camera.slopes(plane)[1], by_lens[..., :5])
     ahead, behind = ([pixels_of(c) for c in changed(size)] for size in (step, -step))
     truth = np.stack([a - b for a, b in zip(ahead, behind, strict=True)], -1) / (
         2 * step

@@ -10,6 +10,8 @@ import scipy.optimize
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
+from evercal.geometry.rays import fit_rays
+from evercal.mapping.built_map import of_rays
 from evercal.mapping.bundle_adjustment import BundleAdjustment
 from evercal.mapping.bundle_equations import COMMON, SHARED, Parameters
 from evercal.mapping.bundle_options import BundleOptions
@@ -190,6 +192,28 @@ def test_missing_distortion_is_estimated() -> None:
     np.testing.assert_allclose(
         same.cameras[0].distortion, distorted.distortion, atol=1e-3
     )
+
+
+def test_the_lens_of_a_hand_eye_calibration_is_free() -> None:
+    """What a wrong file shifts, tangential terms included, is found; the rays agree."""
+    lens = CAMERA.changed([0.005, 4, -3, 0.05, -0.05, 1e-3, -1e-3, 0.02])
+    made = world(lens)
+    options = BundleOptions().for_hand_eye(moves=True)
+    result = adjusted(made, made.truth, CAMERA, options=options)
+    assert result.cameras is not None
+    fit = fit_rays(lens, result.cameras[0])
+    apart = result.common.rotation * fit.own_from_other.inv()
+    assert np.rad2deg(apart.magnitude()) < 0.02
+    assert np.rad2deg(np.median(fit.left_rad)) < 0.01
+    kept = np.rad2deg(np.median(fit_rays(lens, CAMERA).left_rad))
+    assert kept > 0.1
+    # An error of the frame that one of the lens cancels is no error of the rays.
+    camera = result.cameras[0]
+    by_noise, by_lens, _ = of_rays(result, camera, camera, 1.0)
+    of_frame = np.trace(result.common_covariance[3:, 3:])
+    assert np.trace((by_noise + by_lens)[3:, 3:]) < of_frame / 4
+    tight = np.linalg.eigvalsh(by_noise).min()
+    assert tight > 0
 
 
 @pytest.mark.parametrize("late", [0.4, -0.3, 0.0])

@@ -6,7 +6,7 @@
      "translation_m": [3], "quaternion_wxyz": [4], "matrix": [4][4],
      "covariance": [6][6], "sigma_mm": x, "sigma_deg": x, "camera": {...},
      "lens": "estimated", "lenses": {"stated": {...}, "estimated": {...}},
-     "for_stated_lens": {"matrix": [4][4], ...}, "stated_left_deg": x, "images": [...],
+     "for_stated_lens": {"matrix": [4][4], ..., "left_deg": x}, "images": [...],
      "error_terms": [...], "checks": {...}, "joints": [...], "joint_covariance": [k][k],
      "verdict": "...", "source": {...}, "created": "..."}
 
@@ -17,12 +17,12 @@ repeat other values for their readers.
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, get_args
 
 import numpy as np
 
-from evercal.calibration.checks import checks_of
+from evercal.calibration.checks import Checks, checks_of
 from evercal.calibration.framed_pose import FramedPose
 from evercal.calibration.framed_pose import ImageUse as ImageUse
 from evercal.calibration.framed_pose import JointOffset as JointOffset
@@ -81,8 +81,12 @@ class Calibration(FramedPose):
 
     error_terms: tuple[ErrorTerm, ...] = ()
     """Parts of the covariance by cause; from images, those of `CovarianceTerm` and the scatter."""
+    checks: Checks = field(default_factory=Checks)
+    """What it was compared with: `ImageChecks`, `PairChecks` or `LearnedChecks`, by its origin."""
     verdict: str = ""
     """Uses that it serves, one or two sentences."""
+    source: Mapping[str, Any] = field(default_factory=dict)
+    """Command, store, scene and options, JSON values."""
     created: str = ""
     """ISO 8601 time with zone."""
 
@@ -154,8 +158,10 @@ class Calibration(FramedPose):
             **self.transform_to_dict(),
             "sigma_mm": self.sigma_mm,
             "sigma_deg": self.sigma_deg,
-            "for_stated_lens": self.for_program().transform_to_dict(),
-            "stated_left_deg": float(np.rad2deg(self.stated_left_rad)),
+            "for_stated_lens": {
+                **self.for_program().transform_to_dict(),
+                "left_deg": float(np.rad2deg(self.stated_left_rad)),
+            },
             "lenses": {name: own.to_dict() for name, own in self.lenses.items()},
             "images": [vars(image) for image in self.images],
             "error_terms": [vars(term) for term in self.error_terms],
@@ -222,7 +228,14 @@ class Calibration(FramedPose):
         """
         from evercal.calibration.comparison import compare
 
-        return compare(self, other, distance_m)
+        measured = []
+        if self.source.get("map") == other.source.get("map"):
+            for checks in (self.checks, other.checks):
+                if checks.image_scatter:
+                    scatter = np.array(checks.image_scatter)
+                    measured.append((scatter, int(checks.images_used or 1)))
+        distance_m = distance_m or self.checks.target_m or other.checks.target_m
+        return compare(self, other, distance_m, measured)
 
     def export(
         self, format: ExportFormat | str, path: PathLike | None = None, **options: Any

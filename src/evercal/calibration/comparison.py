@@ -29,6 +29,8 @@ _USUAL_SCATTER = np.diag(np.repeat([0.4e-3, np.deg2rad(0.01)], 3) ** 2)
 """Prior covariance of a single image in a map."""
 _USUAL_WEIGHT = 5.0
 """Weight of the prior scatter, in images."""
+Scatter = Sequence[tuple[Array, int]]
+"""Covariances (6, 6) of single images about their mean, each with the number of images."""
 _PARAMETER = 4.0
 """A cause with one more parameter has to explain this much more of the squared distance."""
 _CAUSES = (
@@ -90,9 +92,14 @@ class Comparison:
 
 
 def compare(
-    first: FramedPose, second: FramedPose, distance_m: float | None = None
+    first: FramedPose,
+    second: FramedPose,
+    distance_m: float | None = None,
+    measured: Scatter = (),
 ) -> Comparison:
     """Compare two calibrations of one camera, see `Calibration.distance`.
+
+    `measured` is the scatter of the images of both, where they were located in one map.
 
     Raises:
         InputError: The mounts, the frames or the image sizes differ.
@@ -104,17 +111,18 @@ def compare(
                 f"{name} is {values[0]!r} in the first and {values[1]!r} in the second: compare"
                 " calibrations of one camera in the same frames"
             )
-    distance = distance_m or first.checks.target_m or second.checks.target_m
     notes = []
+    distance = distance_m
     if distance is None:
         distance = USUAL_DISTANCE_M
         notes.append("no working distance is stated: that of a wrist camera is taken")
     if not 0 < distance < np.inf:
-        raise InputError(f"`distance_m` {distance}: give metres above 0")
+        raise InputError(f"`distance` {distance}: give metres above 0")
     shared = _shared(first, second)
     covariance = first.covariance + second.covariance
-    if "map" in shared:
-        covariance = same_map_covariance([_scatter_of(first), _scatter_of(second)])
+    if len(measured) > 1:
+        shared = ("map", *shared)
+        covariance = same_map_covariance(measured)
     own, other, second = _rays(first, second, notes)
     a = first.parent_from_child
     b = second.parent_from_child
@@ -158,10 +166,6 @@ def _rays(
     return own, other, second
 
 
-Scatter = Sequence[tuple[Array, int]]
-"""Covariances (6, 6) of single images about their mean, each with the number of images."""
-
-
 def same_map_covariance(measured: Scatter) -> Array:
     """Covariance (6, 6) of the difference of two poses in one map, whose errors cancel."""
     scatter = pooled_scatter(measured)
@@ -180,21 +184,12 @@ def pooled_scatter(measured: Scatter) -> Array:
 
 def _shared(first: FramedPose, second: FramedPose) -> tuple[str, ...]:
     shared = []
-    of_map = first.source.get("map")
-    scatter = first.checks.image_scatter and second.checks.image_scatter
-    if of_map and of_map == second.source.get("map") and scatter:
-        shared.append("map")
     if first.camera is not None and first.camera == second.camera:
         shared.append("intrinsics")
     used = [{use.name for use in one.images if use.used} for one in (first, second)]
     if used[0] & used[1]:
         shared.append("images")
     return tuple(shared)
-
-
-def _scatter_of(calibration: FramedPose) -> tuple[Array, int]:
-    checks = calibration.checks
-    return np.array(checks.image_scatter), int(checks.images_used or 1)
 
 
 def _cause(first: FramedPose, error: Array, covariance: Array) -> str:

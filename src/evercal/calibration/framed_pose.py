@@ -6,7 +6,6 @@ from typing import Any, Self
 
 import numpy as np
 
-from evercal.calibration.checks import Checks
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.robot.mount import MountName, mount_named
@@ -72,11 +71,6 @@ class FramedPose:
     """(k, k) of the offsets."""
     lenses: Mapping[str, Camera] = field(default_factory=dict, kw_only=True)
     """Intrinsics of this camera by their origin: `stated` with the images, and `estimated`."""
-
-    checks: Checks = field(default_factory=Checks, kw_only=True)
-    """What it was compared with: `ImageChecks`, `PairChecks` or `LearnedChecks`, by its origin."""
-    source: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
-    """Command, store, scene and options, JSON values."""
 
     @property
     def on_gripper(self) -> bool:

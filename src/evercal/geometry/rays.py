@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from evercal.geometry.camera import Camera
 from evercal.typing import Array
 
-MIDDLE = 0.8
-"""Share of width and height in which lenses are compared: few images measure the corners."""
+MIDDLE = (0.1, 0.9)
+"""Part of width and height in which lenses are compared: few images measure the corners."""
 _STEP = 1e-4
 """Change of a parameter for a derivative, as a share of its unit."""
 
@@ -37,7 +37,7 @@ class RayFit(NamedTuple):
 def angles(a: Array, b: Array) -> Array:
     """Angles (m,) between unit vectors (m, 3), radians."""
     chord = np.linalg.norm(a - b, axis=-1)
-    return 2 * np.arcsin(np.minimum(chord / 2, 1))
+    return 2 * np.arcsin(chord / 2)
 
 
 def fit_rays(own: Camera, other: Camera) -> RayFit:
@@ -47,12 +47,9 @@ def fit_rays(own: Camera, other: Camera) -> RayFit:
         ValueError: The images differ in size, or the distortion leaves no rays.
     """
     size = (own.width, own.height)
-    others = (other.width, other.height)
-    if size != others:
-        raise ValueError(
-            f"the intrinsics are of {size} and of {others} pixels; give both for one image size"
-        )
-    across = np.linspace((1 - MIDDLE) / 2, (1 + MIDDLE) / 2, 8)
+    if size != (other.width, other.height):
+        raise ValueError("the intrinsics differ in image size; give both for one size")
+    across = np.linspace(*MIDDLE, 8)
     pixels = np.stack(np.meshgrid(across, across), -1).reshape(-1, 2)
     pixels = pixels * size - 0.5
     rays = np.stack([own.unproject(pixels), other.unproject(pixels)])
@@ -60,7 +57,7 @@ def fit_rays(own: Camera, other: Camera) -> RayFit:
     if rays.shape[1] < 3:
         raise ValueError("the distortion leaves no rays in the middle of the image")
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    turn = Rotation.align_vectors(rays[0], rays[1])[0]
+    turn, _ = Rotation.align_vectors(*rays)
     return RayFit(turn, rays[0], turn.apply(rays[1]))
 
 

@@ -50,10 +50,6 @@ from evercal.typing import Array, IntArray
 HAND_EYE_COVARIANCE_SCALE = 2.5
 """Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated
 over many frames, which residuals do not show (research/handeye.md)."""
-LENS_SIGMA = (0.005, 0.007)
-"""`BundleOptions.lens_sigma` of a hand-eye calibration: 0.5 % of the focal length, and about 0.5 %
-of the width for the principal point. Ten files and methods of one camera differ by as much
-(research/handeye.md)."""
 NOTICEABLE_RAD = 1e-4
 """Landmarks are tracked again if poses and intrinsics moved their projections by more than this:
 some hundredths of a pixel."""
@@ -100,31 +96,8 @@ class MapOptions:
         require_numbers(self, ("support_frames", "rounds"), 1)
 
     def for_hand_eye(self, mount: Mount) -> "MapOptions":
-        """The same options for poses from a rough `gripper_from_camera`.
-
-        The common transform has no prior. The poses of arms have errors of a tenth of a millimetre
-        at least, which bounds the estimated errors of stated poses.
-        """
-        bundle = replace(
-            self.bundle,
-            common_stated=False,
-            # Before one place, the adjusted mount depends on its start by more than the noise.
-            least_systematic=1.0,
-            common_sigma_m=0.2,
-            common_sigma_deg=10.0,
-            lens_sigma=LENS_SIGMA,
-            least_sigma_m=2e-4,
-            least_sigma_deg=0.015,
-        )
-        if not mount.moves:
-            bundle = replace(
-                bundle,
-                least_systematic=0.1,
-                correlation=2.7,
-                least_share=0.0025,
-                least_sigma_m=1e-4,
-                least_sigma_deg=0.01,
-            )
+        """The same options for poses from a rough `gripper_from_camera`."""
+        bundle = self.bundle.for_hand_eye(mount.moves)
         return replace(self, bundle=bundle, mount=mount)
 
 

@@ -9,7 +9,7 @@ relevance of single parameters: MacKay, Bayesian interpolation, 1992). So parame
 do not constrain keep their stated values.
 
 The steps are Levenberg-Marquardt. Landmarks are eliminated by the Schur complement, which leaves
-dense normal equations with six rows a frame: 8 (6 n + 12)^2 bytes, and time in proportion to n^3.
+dense normal equations with six rows a frame: 8 (6 n + 15)^2 bytes, and time in proportion to n^3.
 `MapOptions.support_frames` bounds n; 350 frames take 36 MB.
 """
 

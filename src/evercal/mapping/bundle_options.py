@@ -1,6 +1,6 @@
 """`BundleOptions`: priors and weights of a bundle adjustment."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from evercal.typing import Array
 
 FIXED = 1e-9
 """Prior standard deviation of shared parameters that are not adjusted."""
+LENS_SIGMA = (0.005, 0.007)
+"""`lens_sigma` of a hand-eye calibration: 0.5 % of the focal length, and for the principal point
+about 0.5 % of the width. Files and methods of one camera differ by as much (docs/handeye.md)."""
 _MAY_BE_ZERO = ("relevance", "least_share", "least_systematic")
 """Lower bounds that have no effect at 0."""
 _LEAST = 1e-12
@@ -83,6 +86,34 @@ class BundleOptions:
         require_numbers(self, ("iterations",), 1)
         require_numbers(self, _MAY_BE_ZERO, 0)
         require_numbers(self, vars(self).keys() - others, _LEAST)
+
+    def for_hand_eye(self, moves: bool) -> "BundleOptions":
+        """The same options for poses from a rough `gripper_from_camera`, whose camera may move.
+
+        The common transform has no prior, and the lens is uncertain. The poses of arms have errors
+        of a tenth of a millimetre at least, which bounds the estimated errors of stated poses.
+        """
+        options = replace(
+            self,
+            common_stated=False,
+            # Before one place, the adjusted mount depends on its start by more than the noise.
+            least_systematic=1.0,
+            common_sigma_m=0.2,
+            common_sigma_deg=10.0,
+            lens_sigma=LENS_SIGMA,
+            least_sigma_m=2e-4,
+            least_sigma_deg=0.015,
+        )
+        if moves:
+            return options
+        return replace(
+            options,
+            least_systematic=0.1,
+            correlation=2.7,
+            least_share=0.0025,
+            least_sigma_m=1e-4,
+            least_sigma_deg=0.01,
+        )
 
     def intrinsics_sigma(self, camera: Camera) -> Array:
         """Prior standard deviations (8,) of the intrinsics, in the order of `Camera.slopes`."""

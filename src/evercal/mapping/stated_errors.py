@@ -31,7 +31,7 @@ class Variances:
     weight: Array
     """(n,) weights of the stated poses."""
     shared: Array
-    """(12 + k,) variances of the shared parameters."""
+    """(15 + k,) variances of the shared parameters."""
 
     def close_to(self, other: "Variances", tolerance: float) -> bool:
         """Whether two priors differ by less than this share."""
@@ -85,7 +85,7 @@ class StatedErrors:
         return np.einsum("nij,nj->ni", self.lever, self.of_cameras(parameters))
 
     def of_rows(self, rows: Array) -> Array:
-        """(r, n, 6) errors at their origin by rows (r, 6 n + 12 + k) of all parameters.
+        """(r, n, 6) errors at their origin by rows (r, 6 n + 15 + k) of all parameters.
 
         Of the factor of the parameters' covariance, that of the errors.
         """
@@ -97,7 +97,7 @@ class StatedErrors:
     def prior(
         self, parameters: Parameters, variances: Variances
     ) -> tuple[Array, Array]:
-        """Normal matrix of the priors (6 n + 12 + k, 6 n + 12 + k), and their slope."""
+        """Normal matrix of the priors (6 n + 15 + k, 6 n + 15 + k), and their slope."""
         poses = 6 * self.n
         system = np.zeros((poses + self.size,) * 2)
         slope = np.zeros(poses + self.size)

@@ -40,7 +40,7 @@ VARIANCE_SHRINKAGE = 16
 """Largest divisor of the variance of shared parameters in one iteration."""
 USUAL_OFFSET = 0.05 / 3
 """Prior of the offsets: one pseudo-joint with this offset, in sigmas of the first prior."""
-USUAL_LENS = 0.2
+USUAL_LENS = 0.15
 """The same of the intrinsics."""
 MOST_LENS = 16.0
 """Largest variance of the intrinsics, in first priors: a wrong file is off by several sigma."""

@@ -63,9 +63,9 @@ def camera_from_fields(data: Fields, size: Size | None = None) -> Camera:
     `size` is (width, height) in pixels of the images, if the fields may lack it. ValueError: the
     fields are no camera or several, or the images are distorted otherwise or cut out.
     """
-    # A calibration also holds the intrinsics that were stated.
-    own = {key: value for key, value in data.items() if key != "lenses"}
-    entries = [*_entries(_undotted(own), {}, "")]
+    others = ("lenses", "for_stated_lens")  # of a calibration, beside its camera
+    data = {key: value for key, value in data.items() if key not in others}
+    entries = [*_entries(_undotted(data), {}, "")]
     if not entries:
         return camera_of(data, size)
     cameras: dict[str, Camera] = {}
