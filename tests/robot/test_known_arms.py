@@ -71,6 +71,9 @@ def test_an_arm_is_named_or_given_by_its_urdf(tmp_path: Path) -> None:
     assert arm.joints == ("j", "k")
     np.testing.assert_allclose(arm.ranges, [[-0.5, 1, 2.5]] * 2)
     assert arm.assumed == ((0, 0),)
+    turning = file.read_text().replace(' lower="-0.5" upper="2.5"', "")
+    file.write_text(turning.replace("revolute", "continuous"))
+    assert np.isfinite(arm_of(str(file)).ranges).all()
     assert len(arm_of(str(file), "b", "c").joints) == 1
     assert arm_of("UR5e").name == "ur5e"
 
@@ -80,12 +83,11 @@ def test_an_accuracy_is_that_of_the_joints_or_of_the_gripper() -> None:
     slopes = np.zeros((4, 6, 2))
     slopes[:, 0] = np.array([0.3, 0.4])
     assert offset_rad(None, arm, slopes) == USUAL_RAD["hobby"]
-    assert offset_rad(None, None, slopes) == USUAL_RAD["cobot"]
-    assert offset_rad("0.2deg", arm, slopes) == np.radians(0.2)
+    assert offset_rad("0.2deg", arm, slopes) == pytest.approx(np.radians(0.2))
     assert offset_rad("1.5 mm", arm, slopes) == pytest.approx(0.003)
 
 
 @pytest.mark.parametrize("text", ["0.2", "0deg", "-1mm", "1mm2", "nan deg", "0.2 rad"])
 def test_another_accuracy_is_refused(text: str) -> None:
     with pytest.raises(InputError, match=r"`arm_accuracy` .* such as 0.2deg"):
-        offset_rad(text, None, np.ones((1, 6, 1)))
+        offset_rad(text, known_arm("ur5e"), np.ones((1, 6, 1)))

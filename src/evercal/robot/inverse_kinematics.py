@@ -24,6 +24,7 @@ _LEVER_M = 0.3
 _WEIGHTS = np.array([1.0] * 3 + [_LEVER_M] * 3)
 _REACHED_M = 0.02
 """Real arms differ from their maker's numbers."""
+_TURN = 2 * np.pi
 _SLACK = 0.05
 """Radians or metres by which a joint may exceed its limits."""
 _REST_WEIGHT = 0.1
@@ -176,5 +177,5 @@ def _away(arm: Arm, values: Array, others: Array) -> Array:
 
 def _turned(arm: Arm, differences: Array) -> Array:
     """Differences of values (..., k); those of angles within half a turn."""
-    turns = np.round(differences / (2 * np.pi)) * arm.rotates()
-    return differences - 2 * np.pi * turns
+    turns = np.round(differences / _TURN) * arm.rotates()
+    return differences - _TURN * turns

@@ -86,22 +86,22 @@ def arm_of(stated: str, base: str | None = None, gripper: str | None = None) -> 
     return model.arm(*model.chosen_links(base, gripper))
 
 
-def offset_rad(stated: str | None, arm: Arm | None, slopes: Array) -> float:
+def offset_rad(stated: str | None, arm: Arm, slopes: Array) -> float:
     """Standard deviation of joint offsets by an accuracy such as 0.2deg of the joints.
 
     Or 1mm of the gripper, which `slopes` (n, 6, k) of the joints move; if omitted, that of the
     class of the arm.
     """
     if stated is None:
-        kind = ARM_NAMES.get(arm.name if arm else "", "cobot")
-        return USUAL_RAD[kind]
+        return USUAL_RAD[ARM_NAMES.get(arm.name, "cobot")]
     number = re.fullmatch(r"(\d*\.?\d*[1-9]\d*) ?(deg|mm)", stated)
     if number is None:
         raise InputError(
             f"`arm_accuracy` {stated!r}: give the standard deviation of the joints, such as 0.2deg,"
             " or of the gripper, such as 1mm"
         )
+    size = float(number[1])
     if number[2] == "deg":
-        return float(np.radians(float(number[1])))
-    lever_m = np.linalg.norm(slopes[:, :3]) / np.sqrt(len(slopes))
-    return float(number[1]) / 1000 / lever_m.item()
+        return size * np.pi / 180
+    squares = (slopes[:, :3] ** 2).sum()
+    return size / 1000 / np.sqrt(squares / len(slopes)).item()

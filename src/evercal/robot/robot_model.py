@@ -144,11 +144,13 @@ class RobotModel:
                 before = np.eye(4)
             if backwards:
                 before = before @ np.linalg.inv(origin)
-        drivers = [self._joint_named[name].numbers for name in names]
         limits = [
-            numbers["limit lower"] + numbers["limit upper"] for numbers in drivers
+            self._joint_named[name].numbers[end]
+            for name in names
+            for end in ("limit lower", "limit upper")
         ]
-        lower, upper = np.reshape(limits, (-1, 2)).clip(-np.pi, np.pi).T
+        within = np.reshape(limits, (-1, 2)).clip(-_LARGEST_RAD, _LARGEST_RAD)
+        lower, upper = within.T
         ranges = np.stack([lower, (lower + upper) / 2, upper], 1)
         return Arm(tuple(names), tuple(chain), before, ranges, self.path.name)
 
