@@ -164,9 +164,9 @@ HowRead = Annotated[Reading, arg(name="")]
 class ArmGiven:
     """The arm that moved the gripper; its joints make errors that all images share."""
 
-    arm: Annotated[str | None, shown("NAME|FILE.urdf")] = None
-    """The robot, such as ur5e, panda or irb120, or its URDF: its joints explain errors that the
-    images share. Default: a usual arm."""
+    arm: Name = None
+    """The robot, such as ur5e, panda or irb120, or the file of its URDF: its joints explain errors
+    that the images share. Default: a usual arm."""
     arm_accuracy: Annotated[str | None, shown("0.2deg|1mm")] = None
     """Standard deviation of the joints' offsets, or of the gripper's position. Default: that of
     the arm's class, 0.06deg of industrial arms, 0.2deg of cobots, 1.1deg of hobby arms."""

@@ -77,12 +77,13 @@ def inverse_kinematics(poses: SE3, arm: Arm) -> list[Reached]:
 
 def _solved(arm: Arm, poses: SE3) -> tuple[Array, BoolArray]:
     """Values (n, k) of the branch that moves least between similar poses, and which are reached."""
-    spread = np.linspace(
-        0,
-        len(poses) - 1,
-        _FOLLOWED,
+    some = np.unique(
+        np.linspace(
+            0,
+            len(poses) - 1,
+            _FOLLOWED,
+        ).astype(int)
     )
-    some = np.unique(spread.astype(int))
     metres, radians = pose_distance(poses[:, None], poses[some])
     distances = metres + _LEVER_M * radians
     middle = some[distances.sum(0).argmin()]
@@ -111,11 +112,12 @@ def _solved(arm: Arm, poses: SE3) -> tuple[Array, BoolArray]:
         arm.ranges.T[1],
     )
     best = np.lexsort([motion, -reached.sum(1)])[0]
-    nearest = distances[:, reached[best]].argmin(1)
+    solved = reached[best] | (some == middle)
+    nearest = distances[:, solved].argmin(1)
     return _iterate(
         arm,
         poses,
-        values[best][reached[best]][nearest],
+        values[best][solved][nearest],
     )
 
 

@@ -67,9 +67,8 @@ def known_arm(name: str) -> Arm:
         )
         if not rotates:
             ranges[i] = arm["ranges"][i]
-    joints = tuple(map(str, range(1, len(links))))
     return Arm(
-        joints,
+        tuple(map(str, range(1, len(links)))),
         tuple(chain),
         links[-1],
         ranges,
