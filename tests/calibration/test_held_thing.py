@@ -9,15 +9,17 @@ import pytest
 
 from evercal.calibration.from_map.hand_eye_start import HandEyeStart
 from evercal.calibration.from_map.image_pairs import ImagePair
+from evercal.calibration.held_thing.background import background_motion
 from evercal.calibration.held_thing.moving_parts import (
     MovingPart,
     in_full_size,
     moving_parts,
     reduced,
 )
-from evercal.calibration.held_thing.slip import largest_step
+from evercal.calibration.held_thing.slip import largest_step, motion_warnings
 from evercal.calibration.held_thing.thing_map import of_whole_images
 from evercal.calibration.held_thing.windows import cropped, windows
+from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import SceneMap
@@ -149,3 +151,33 @@ def test_a_step_is_told_from_noise_and_drift(kind: str) -> None:
         found += step is not None
         assert step is None or kind != "step" or step.before == 12
     assert found == (40 if kind == "step" else 0)
+
+
+def test_the_background_says_whether_the_camera_moved() -> None:
+    frames, _ = frames_of(12, 2.0)
+    moving, _ = moving_parts(frames)
+    still = background_motion(moving)
+    assert np.rad2deg(np.nanmax(np.abs(still))) < 0.02
+    moved = list(frames)
+    for i in range(6, 12):
+        image = np.roll(frames[i].read_image(), 3, axis=1)
+        moved[i] = replace(frames[i], image=image)
+    bumped = background_motion(moving_parts(moved)[0])
+    # 3 pixels at a focal length of 300.
+    assert np.nanmedian(bumped[6:, 0]) == pytest.approx(0.01, abs=1e-3)
+    rng = np.random.default_rng(0)
+    residuals = {frame.name: rng.normal(0, 1e-5, 6) for frame in frames}
+    steps = {name: value.copy() for name, value in residuals.items()}
+    built = MagicMock(hand_eye=MagicMock(residuals=residuals, moved=steps))
+    assert motion_warnings(frames, built, still) == ()
+    [words] = motion_warnings(frames, built, bumped)
+    assert words.startswith("the background moves by 0.57 deg")
+    for i in range(6, 12):
+        steps[str(i)] += [0.005, 0, 0, 0, 0, 0]
+    [words] = motion_warnings(frames, built, still)
+    assert "the camera did not move" in words
+    assert "before image 6" in words
+    unknown = np.full((12, 2), np.nan)
+    for background in (bumped, unknown):
+        with pytest.raises(InputError, match=r"the camera moved by 5\.0 mm"):
+            motion_warnings(frames, built, background)

@@ -11,12 +11,13 @@ from evercal.calibration.from_map.hand_eye_start import (
     gripper_frames,
     hand_eye_start,
 )
+from evercal.calibration.held_thing.background import background_motion
 from evercal.calibration.held_thing.moving_parts import (
     in_full_size,
     moving_parts,
     reduced,
 )
-from evercal.calibration.held_thing.slip import refuse_slip
+from evercal.calibration.held_thing.slip import motion_warnings
 from evercal.calibration.held_thing.thing_map import (
     in_windows,
     of_whole_images,
@@ -100,8 +101,8 @@ def learn_held_thing(
     split = HeldOutSplit(posed.train, ())
     learned = LearnedScene(scene, built, split, recording.metric)
     report = learned.report(contents, began)
-    refuse_slip(frames, built)
-    estimate = hand_eye_of(start, built, frames)
+    warnings = motion_warnings(frames, built, background_motion(moving))
+    estimate = hand_eye_of(start, built, frames, warnings=warnings)
     shown = _to_locate(small, built)
     poses = located_poses(localizer_of(contents, scene), shown)
     estimate = with_image_scatter(estimate, shown, poses)

@@ -106,10 +106,12 @@ def hand_eye_of(
     built: BuiltMap,
     frames: Sequence[Frame],
     given: SE3 | None = None,
+    warnings: tuple[str, ...] = (),
 ) -> HandEye:
     """Return the estimate of a map that was built from `frames` with `MapOptions.for_hand_eye`.
 
-    `given` is `gripper_from_camera` from another source, to compare with.
+    `given` is `gripper_from_camera` from another source, to compare with. `warnings` are further
+    reasons not to rely on the estimate.
     """
     correction = built.hand_eye
     assert correction is not None, "the map was built for a hand-eye calibration"
@@ -146,10 +148,8 @@ def hand_eye_of(
     )
     if correction.arm is not None:
         calibration = _with_joints(calibration, correction.arm, frames)
-    warnings = _warnings(built.adjusted)
-    advice = ""
-    if start.mount.moves:
-        advice = _advice(frames, estimate)
+    warnings = (*_warnings(built.adjusted), *warnings)
+    advice = _advice(frames, estimate) if start.mount.moves else ""
     return HandEye(
         replace(calibration, verdict=verdict_of(calibration, warnings, advice)),
         start.pairs,

@@ -16,6 +16,11 @@ SLIP_CHANCE = 1e-4
 SLIP_SHARE = 0.5
 """Least share of the sum of squared residuals that a step explains."""
 
+MOVED_DEG = 0.1
+"""Motion of the background above which the camera moved; tracking errs by a tenth of it."""
+LEAST_FRAMES = 3
+"""Minimum number of images before and after such a motion."""
+
 
 class Step(NamedTuple):
     """A step in a sequence."""
@@ -28,14 +33,26 @@ class Step(NamedTuple):
     """Share of the sum of squares that it explains."""
 
 
-def refuse_slip(frames: Sequence[Frame], built: BuiltMap) -> None:
+def motion_warnings(
+    frames: Sequence[Frame], built: BuiltMap, background: Array
+) -> tuple[str, ...]:
     """Refuse a recording of a fixed camera in which the camera or the thing moved once.
 
-    A thing that slips in the gripper steps in the gripper's residuals, a camera in its own.
+    A thing that slips in the gripper steps in the gripper's residuals, a camera in its own. Where
+    the background stands still, the camera did not move, and errors of the arm look like it.
+
+    Args:
+        frames: (n,) frames of the recording.
+        built: The map of the thing.
+        background: (n, 2) radians, see `background_motion`.
+
+    Returns:
+        Reasons not to rely on the calibration.
     """
     correction = built.hand_eye
     assert correction is not None, "the map was built for a hand-eye calibration"
-    names = [frame.name for frame in frames if frame.name in correction.residuals]
+    used = [i for i, f in enumerate(frames) if f.name in correction.residuals]
+    names = [frames[i].name for i in used]
     largest = None
     what = ""
     for residuals, carrier in (
@@ -46,13 +63,36 @@ def refuse_slip(frames: Sequence[Frame], built: BuiltMap) -> None:
         if step is not None and (largest is None or step.share > largest.share):
             largest = step
             what = carrier
+    drift_deg = _range_deg(background)
     if largest is not None:
+        first = names[largest.before]
+        if what == "the camera" and drift_deg < MOVED_DEG:
+            return (
+                f"the gripper's poses and the images part before image {first}, while the"
+                f" background stands still to {drift_deg:.2f} deg: the camera did not move; check"
+                " the grip and the arm, or use the images before or after",
+            )
         millimetres, degrees = length_mm_deg(largest.size)
         raise InputError(
             f"{what} moved by {millimetres:.1f} mm and {degrees:.2f} deg before image"
-            f" {names[largest.before]}: fasten it and record again, or use the images before or"
-            " after"
+            f" {first}: fasten it and record again, or use the images before or after"
         )
+    if drift_deg > MOVED_DEG:
+        return (
+            f"the background moves by {drift_deg:.2f} deg in the recording: fasten the camera and"
+            " record again",
+        )
+    return ()
+
+
+def _range_deg(background: Array) -> float:
+    """Motion of the background between the halves that differ most; NaN if it is not known."""
+    known = background[np.isfinite(background).all(1)]
+    if 2 * len(known) < len(background) or len(known) < 2 * LEAST_FRAMES:
+        return np.nan
+    places = range(LEAST_FRAMES, len(known) - LEAST_FRAMES + 1)
+    steps = [np.median(known[k:], 0) - np.median(known[:k], 0) for k in places]
+    return float(np.rad2deg(np.linalg.norm(steps, axis=1).max()))
 
 
 def largest_step(values: Array) -> Step | None:

@@ -1,0 +1,54 @@
+"""Whether what stands still before a fixed camera moved in its images: then the camera moved."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from evercal.calibration.held_thing.moving_parts import MovingPart
+from evercal.recordings.frame import Frame
+from evercal.recordings.images import pixels_of
+from evercal.typing import Array, Image
+
+POINTS = 400
+"""Maximum number of points that are tracked."""
+LEAST_POINTS = 30
+"""Minimum number of points in an image."""
+AGAIN_PX = 0.3
+"""Largest distance of a point that is tracked there and back, and scatter of their shifts."""
+
+
+def background_motion(moving: Sequence[Frame]) -> Array:
+    """(n, 2) radians by which the background moved in frames of `moving_parts`, against the first.
+
+    NaN where too few points are tracked, or move differently.
+    """
+    motion = np.full((len(moving), 2), np.nan)
+    first = moving[0]
+    assert isinstance(first.image, MovingPart), "a frame of moving_parts"
+    grey = _grey(first)
+    still = (~first.image.moving).astype(np.uint8)
+    mask = cv2.erode(still, np.ones((9, 9), np.uint8))
+    mask = cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    points = cv2.goodFeaturesToTrack(grey, POINTS, 0.01, 8, mask=mask)
+    if points is None or len(points) < LEAST_POINTS:
+        return motion
+    focal = [first.camera.fx, first.camera.fy]
+    for i, frame in enumerate(moving):
+        other = _grey(frame)
+        tracked, _, _ = cv2.calcOpticalFlowPyrLK(grey, other, points, points.copy())
+        back, _, _ = cv2.calcOpticalFlowPyrLK(other, grey, tracked, points.copy())
+        again = np.abs(back - points).max((1, 2)) < AGAIN_PX
+        shift = (tracked - points)[again].reshape(-1, 2)
+        if len(shift) < max(LEAST_POINTS, len(points) / 3):
+            continue
+        middle = np.median(shift, 0)
+        if np.median(np.abs(shift - middle)) < AGAIN_PX:
+            motion[i] = middle / focal
+    return motion
+
+
+def _grey(frame: Frame) -> Image:
+    assert isinstance(frame.image, MovingPart), "a frame of moving_parts"
+    grey = cv2.cvtColor(pixels_of(frame.image.image), cv2.COLOR_RGB2GRAY)
+    return np.asarray(grey, np.uint8)
