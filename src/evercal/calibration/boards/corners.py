@@ -59,7 +59,10 @@ class BoardView:
         object.__setattr__(self, "points_m", points)
         object.__setattr__(self, "pixels", pixels)
 
-    def __getitem__(self, use: BoolArray) -> "BoardView":
+    def __getitem__(
+        self,
+        use: BoolArray,
+    ) -> "BoardView":
         return BoardView(self.points_m[use], self.pixels[use])
 
 
@@ -97,7 +100,10 @@ class BoardPose:
     """(q,) `lens_normal` times the change of the intrinsics that fits the corners best."""
     slopes: CornerSlopes
 
-    def weighted(self, row_ratio: float) -> "BoardPose":
+    def weighted(
+        self,
+        row_ratio: float,
+    ) -> "BoardPose":
         """Return the pose that allows for shifts that grow with the row.
 
         Args:
@@ -145,7 +151,10 @@ class Bend(NamedTuple):
     1 / metres."""
 
     @classmethod
-    def none(cls, views: Sequence[BoardView]) -> "Bend":
+    def none(
+        cls,
+        views: Sequence[BoardView],
+    ) -> "Bend":
         """Return the plane of a board that views show."""
         points = np.concatenate([view.points_m for view in views])
         half = np.ptp(points, axis=0) / 2
@@ -155,7 +164,10 @@ class Bend(NamedTuple):
             np.zeros(len(BEND)),
         )
 
-    def slopes(self, points: Array) -> Array:
+    def slopes(
+        self,
+        points: Array,
+    ) -> Array:
         """Return the (k, 3, b) derivative of points (k, 3) by the terms."""
         x, y, _ = (points - self.middle).T / self.size
         bent = [x**i * y**j / (factorial(i) * factorial(j)) for i, j in _POWERS]
@@ -199,7 +211,10 @@ def board_pose(
     return _fitted(pose, (view.pixels - projected).ravel(), slopes)
 
 
-def _by_rows(pixels: Array, camera: Camera) -> Array:
+def _by_rows(
+    pixels: Array,
+    camera: Camera,
+) -> Array:
     """Return (2 k, 4) shifts in x and y, a roll and a zoom that grow with the row."""
     x, y = ((pixels - [camera.cx, camera.cy]) / camera.height).T
     one = np.ones_like(x)

@@ -32,14 +32,21 @@ class CornerNoise(NamedTuple):
     """Standard deviation of the shift of the last row of an image against the first."""
 
     @classmethod
-    def plain(cls, poses: Sequence[BoardPose]) -> Self:
+    def plain(
+        cls,
+        poses: Sequence[BoardPose],
+    ) -> Self:
         """Estimate the noise where there is no shift."""
         squared = np.array([pose.squared_px for pose in poses])
         freedom = np.array([max(2 * pose.corners - 6, 1) for pose in poses])
         return cls(float(np.sqrt(_variance(squared, freedom)[0])))
 
     @classmethod
-    def of(cls, poses: Sequence[BoardPose], most_shift_px: float = np.inf) -> Self:
+    def of(
+        cls,
+        poses: Sequence[BoardPose],
+        most_shift_px: float = np.inf,
+    ) -> Self:
         """Estimate both from least-squares poses by maximum likelihood."""
         used = [pose for pose in poses if pose.corners >= _MIN_CORNERS]
         if not used or not most_shift_px:
@@ -59,7 +66,10 @@ class CornerNoise(NamedTuple):
         shift_px = min(float(_SIZES_PX[costs.argmin()]), most_shift_px)
         return cls(float(np.sqrt(variance)), shift_px)
 
-    def weighted(self, poses: Sequence[BoardPose]) -> list[BoardPose]:
+    def weighted(
+        self,
+        poses: Sequence[BoardPose],
+    ) -> list[BoardPose]:
         """Return the poses that allow for the shift."""
         if not self.row_shift_px:
             return list(poses)
@@ -80,7 +90,10 @@ def _shift(pose: BoardPose) -> tuple[Array, Array]:
     return np.where(tells, signals / sizes.clip(1e-12), 0.0), np.where(tells, sizes, 0)
 
 
-def _variance(squared: Array, freedom: Array) -> tuple[float, BoolArray]:
+def _variance(
+    squared: Array,
+    freedom: Array,
+) -> tuple[float, BoolArray]:
     """Variance of a coordinate, and (n,) the images that fit well."""
     variance = squared / freedom
     inliers = variance <= 4 * np.median(variance) + 1e-12

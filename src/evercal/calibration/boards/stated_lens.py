@@ -44,7 +44,10 @@ def compared_lens(stated: BoardPoses) -> tuple[BoardPoses, str]:
     return replace(stated, images=tuple(images)), words
 
 
-def _widened(image: BoardImage, other: SE3 | None) -> BoardImage:
+def _widened(
+    image: BoardImage,
+    other: SE3 | None,
+) -> BoardImage:
     """The image with a covariance that contains another pose of the board."""
     pose = image.camera_from_board
     if pose is None or other is None:
@@ -54,7 +57,10 @@ def _widened(image: BoardImage, other: SE3 | None) -> BoardImage:
     return replace(image, covariance=image.covariance + np.outer(away, away))
 
 
-def _moved_px(stated: Camera, estimated: Camera) -> float:
+def _moved_px(
+    stated: Camera,
+    estimated: Camera,
+) -> float:
     """Largest distance between the corners of the image by both intrinsics."""
     right = stated.width - 1
     down = stated.height - 1

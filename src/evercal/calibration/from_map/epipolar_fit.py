@@ -88,7 +88,11 @@ class EpipolarFit:
             positions = [gripper - depth * towards for depth in DEPTHS_M]
         return [np.r_[np.zeros(3), position] for position in positions]
 
-    def solve(self, start: Array, centre: Array) -> Array:
+    def solve(
+        self,
+        start: Array,
+        centre: Array,
+    ) -> Array:
         """Minimise from a start, with a prior about `centre`; all are parameters (6,)."""
         scale = float(np.deg2rad(ANGLE_DEG))
         x = start
@@ -96,7 +100,10 @@ class EpipolarFit:
         is_joint = np.arange(len(start)) >= 6
         spread = np.where(is_joint, JOINT_SPREAD, SPREAD_M[self.mount])[3:]
 
-        def residuals(x: Array, scale: float) -> Array:
+        def residuals(
+            x: Array,
+            scale: float,
+        ) -> Array:
             # The matches of a pair share the errors of its poses, so each pair counts as one match.
             away = np.sqrt(matches) * (x - centre)[3:] / spread
             # The loss of these residuals is quadratic: the prior is no outlier.
@@ -118,7 +125,10 @@ class EpipolarFit:
             scale = min(scale, max(3 * median, 1e-4))
         return x
 
-    def distances(self, x: Array) -> Array:
+    def distances(
+        self,
+        x: Array,
+    ) -> Array:
         """(..., m) angles of matches from their epipolar planes, radians.
 
         `x` is (..., 6), or the parameters of one camera and of its arm.
@@ -140,26 +150,39 @@ class EpipolarFit:
         slope = np.sqrt(np.maximum(squares, 1e-12))
         return (self.second * in_second).sum(-1) / slope
 
-    def slopes(self, x: Array) -> Array:
+    def slopes(
+        self,
+        x: Array,
+    ) -> Array:
         """(m, 6) derivatives of `distances` at parameters (6,)."""
         steps = np.concatenate([np.zeros((1, 6)), STEP * np.eye(6)])
         at, *moved = self.distances(x + steps)
         return (np.array(moved) - at).T / STEP
 
-    def medians(self, x: Array) -> Array:
+    def medians(
+        self,
+        x: Array,
+    ) -> Array:
         """Median distance of the matches of each pair, radians."""
         distance = np.abs(self.distances(x))
         pairs = range(len(self.pairs))
         return np.array([np.median(distance[self.number == i]) for i in pairs])
 
-    def transform(self, x: Array) -> SE3:
+    def transform(
+        self,
+        x: Array,
+    ) -> SE3:
         """parent_from_camera of parameters (6,)."""
         rotation = Rotation.from_rotvec(x[..., :3]) * self.rotation
         quaternion = rotation.as_quat(canonical=True, scalar_first=True)
         return SE3(quaternion, x[..., 3:6])
 
 
-def first_rotation(poses: SE3, pairs: Sequence[ImagePair], mount: Mount) -> Rotation:
+def first_rotation(
+    poses: SE3,
+    pairs: Sequence[ImagePair],
+    mount: Mount,
+) -> Rotation:
     """The rotation from which the distances of some matches become smallest.
 
     Essential matrices would give it faster, but those of a small or flat thing may be wrong by any

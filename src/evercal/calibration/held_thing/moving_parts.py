@@ -48,7 +48,10 @@ class MovingPart(StoredImage):
         return without(pixels_of(self.image), self.moving)
 
 
-def reduced(frame: Frame, short_side: int) -> Frame:
+def reduced(
+    frame: Frame,
+    short_side: int,
+) -> Frame:
     """The frame with a smaller image in memory, if it is larger."""
     image = frame.read_image()
     if min(image.shape[:2]) <= short_side:
@@ -70,7 +73,10 @@ def moving_parts(frames: Sequence[Frame]) -> tuple[tuple[Frame, ...], float]:
     return tuple(moving), share
 
 
-def in_full_size(moving: Frame, frame: Frame) -> Frame:
+def in_full_size(
+    moving: Frame,
+    frame: Frame,
+) -> Frame:
     """A frame of `moving_parts` with the image and camera of the frame that it was reduced from."""
     assert isinstance(moving.image, MovingPart), "a frame of moving_parts"
     image = replace(moving.image, image=frame.image)
