@@ -26,6 +26,10 @@ VERBS = {
         "trust",
         "other cameras, few images, an inaccurate arm: errors and deviations",
     ),
+    "lens-answers": (
+        "lens_answers",
+        "exported frames of a wrist camera whose driver states a wrong lens",
+    ),
     "fisheye": (
         "fisheye",
         "rooms through lenses of 150 and 180 degrees, beside a pinhole",

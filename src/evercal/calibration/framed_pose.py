@@ -112,13 +112,11 @@ class FramedPose:
 
         Root mean square over the middle of the image; 0 if nothing is stated or estimated.
         """
-        cameras = [self.lenses.get(name) for name in ("stated", "estimated")]
-        stated, estimated = cameras
-        if stated is None or estimated is None or stated == estimated:
+        if not {"stated", "estimated"} <= self.lenses.keys():
             return 0.0
         from evercal.geometry.rays import fit_rays
 
-        left = fit_rays(estimated, stated).left_rad
+        left = fit_rays(self.lenses["estimated"], self.lenses["stated"]).left_rad
         return float(np.sqrt((left**2).mean()))
 
     def for_lens(self, lens: Camera | str) -> Self:

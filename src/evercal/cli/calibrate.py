@@ -1,5 +1,6 @@
 """`evercal calibrate`."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -146,6 +147,7 @@ def calibration_lines(
     yield f"  quaternion   {numbers(pose.rotation_wxyz, '+.6f')} wxyz"
     spread = f"{calibration.sigma_mm:.2f} mm, {calibration.sigma_deg:.3f} deg"
     yield f"  uncertainty  {spread} (standard deviation per axis)"
+    yield from lens_lines(calibration)
     terms = calibration.error_terms
     for term, share in zip(terms, position_shares(terms), strict=True):
         if term.translation_mm >= 0.005 or term.rotation_deg >= 0.0005:
@@ -165,6 +167,16 @@ def calibration_lines(
     for image in rejected:
         yield f"    rejected   {image.name}: {image.reason}"
     yield f"  verdict      {calibration.verdict}"
+
+
+def lens_lines(calibration: "Calibration") -> Iterator[str]:
+    """What the pose is for, where the estimated intrinsics are not the stated ones."""
+    if calibration.lens == "estimated" and "stated" in calibration.lenses:
+        left = math.degrees(calibration.stated_left_rad)
+        yield (
+            "  intrinsics   the pose is for the estimated ones; 'evercal export' turns it for the"
+            f" stated ones, which leave {left:.3f} deg that no pose explains"
+        )
 
 
 def joint_lines(joints: Sequence["JointOffset"], file: object) -> Iterator[str]:

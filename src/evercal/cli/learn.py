@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 from evercal.choices import Preset
 from evercal.cli import args
-from evercal.cli.calibrate import joint_lines
+from evercal.cli.calibrate import joint_lines, lens_lines
 from evercal.cli.console import require_writable, say, say_notes, size
 from evercal.cli.info import adjusted_row
 from evercal.errors import InputError
@@ -304,6 +304,7 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
             f" standard deviation {pose.sigma_mm:.2f} mm and {pose.sigma_deg:.3f} deg per axis;"
             f" {found.pairs} of {found.of_pairs} image pairs are inliers"
         )
+        yield from lens_lines(found.calibration)
         yield from map("warning: {}".format, found.warnings)
         if found.advice:
             yield f"warning: {found.advice}"

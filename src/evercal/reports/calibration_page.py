@@ -2,6 +2,7 @@
 
 import math
 import os
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -76,6 +77,10 @@ def difference(new: Calibration, old: Calibration) -> Difference:
             f"`against`: it is {old.mount} and the calibration is {new.mount}; give one of the"
             " same mount"
         )
+    # For one lens; without intrinsics the frames are compared.
+    with suppress(InputError):
+        if new.camera is not None:
+            old = old.for_lens(new.camera)
     offset = deviations(SE3.stack([new.parent_from_child]), old.parent_from_child)[0]
     x, y, z = (1000 * offset[:3]).tolist()
     return Difference(*length_mm_deg(offset), (x, y, z))

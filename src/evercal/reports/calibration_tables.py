@@ -144,6 +144,7 @@ def camera_table(calibration: Calibration) -> Table:
     rows = []
     if camera is not None:
         sigma = calibration.checks.camera_sigma or {}
+        rows.append(("the pose is for", calibration.lens or "these", "-"))
         rows.append(("image size (px)", f"{camera.width}x{camera.height}", "-"))
         for name in ("fx", "fy", "cx", "cy"):
             value = getattr(camera, name)

@@ -114,12 +114,21 @@ class PairSolution:
             covariance=(covariance + covariance.T) / 2,
             parent_frame=self.parent,
             camera=self.camera,
+            lenses=self._lenses(),
             images=self._images(),
             error_terms=self._error_terms(),
             checks=PairChecks(**self._checks(time_offset_s)),
             created=datetime.now(UTC).isoformat(timespec="seconds"),
         )
         return replace(calibration, verdict=verdict(calibration))
+
+    def _lenses(self) -> dict[str, Camera]:
+        lenses = {}
+        if self.camera is not None and self.corners is not None:
+            lenses["estimated"] = self.camera
+            if self.corners.stated:
+                lenses["stated"] = self.corners.camera
+        return lenses
 
     def _checks(
         self,
