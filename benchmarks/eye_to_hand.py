@@ -180,9 +180,9 @@ def _measured(method: str, condition: Condition, data: Path, setting: Setting) -
     if isinstance(answer, SE3):
         mm, deg = pose_distance_mm_deg(answer, true_cameras[0])
         return {"seconds": seconds, "Shah_mm": mm, "Shah_deg": deg}
-    errors = [
-        pose_error(answer.uncertain_pose, true_camera) for true_camera in true_cameras
-    ]
+    # The truth is for the stated intrinsics.
+    pose = answer.for_program().uncertain_pose
+    errors = [pose_error(pose, true_camera) for true_camera in true_cameras]
     nearest = min(errors, key=lambda error: float(error["mm"]))
     return {**nearest, "verdict": answer.verdict, "seconds": seconds}
 

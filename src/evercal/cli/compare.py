@@ -1,16 +1,22 @@
 """`evercal compare`."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
 from evercal.cli import args
 
-if TYPE_CHECKING:
-    from evercal.calibration.comparison import Comparison
+_LINES = """\
+{0.verdict}
+  rays         {0.rays_deg[0]:.3f} deg apart, {0.rays_mm[0]:.2f} mm at {0.distance_m:g} m
+    90 % below {0.rays_deg[1]:.3f} deg, {0.rays_mm[1]:.2f} mm
+  camera       {0.pose_mm:.2f} mm, {0.pose_deg:.3f} deg apart
+  stated       {0.sigma_mm:.2f} mm, {0.sigma_deg:.3f} deg (standard deviation of it per axis)
+  intrinsics   {0.left_deg:.3f} deg between rays that no pose explains
+  in common    {1}: such errors do not show here"""
+"""Text of a `Comparison`, and of what both share."""
 
 
 @dataclass(frozen=True)
@@ -35,22 +41,12 @@ class Compare(args.Verb):
 
         first = calibration_at(self.first)
         compared = first.distance(calibration_at(self.second), self.distance)
-        self.answer(compared.to_dict(), *_lines(compared))
+        notes = map("  note         {}".format, compared.notes)
+        self.answer(
+            compared.to_dict(),
+            *_LINES.format(compared, ", ".join(compared.shared) or "nothing").split(
+                "\n"
+            ),
+            *notes,
+        )
         return 0 if compared.agree else 1
-
-
-def _lines(compared: "Comparison") -> Iterator[str]:
-    angle, largest = compared.rays_deg
-    mm, most = compared.rays_mm
-    yield compared.verdict
-    yield (
-        f"  rays         {angle:.3f} deg apart, {mm:.2f} mm at {compared.distance_m:g} m"
-        f" (90 % below {largest:.3f} deg, {most:.2f} mm)"
-    )
-    yield f"  camera       {compared.pose_mm:.2f} mm, {compared.pose_deg:.3f} deg apart"
-    spread = f"{compared.sigma_mm:.2f} mm, {compared.sigma_deg:.3f} deg"
-    yield f"  stated       {spread} (standard deviation of the difference per axis)"
-    yield f"  intrinsics   {compared.left_deg:.3f} deg between rays that no pose explains"
-    if compared.shared:
-        yield f"  in common    {', '.join(compared.shared)}: such errors do not show here"
-    yield from map("  note         {}".format, compared.notes)
