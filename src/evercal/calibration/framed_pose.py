@@ -104,7 +104,8 @@ class FramedPose:
         if own.distortion:
             terms = " ".join(map("{:.6g}".format, own.distortion))
             numbers = f"{numbers}, distortion {terms}"
-        return f"the {self.lens} intrinsics {numbers}".replace("  ", " ")
+        name = self.lens or "camera's"
+        return f"the {name} intrinsics {numbers}"
 
     @property
     def stated_left_rad(self) -> float:

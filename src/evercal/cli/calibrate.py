@@ -172,10 +172,11 @@ def calibration_lines(
 def lens_lines(calibration: "Calibration") -> Iterator[str]:
     """What the pose is for, where the estimated intrinsics are not the stated ones."""
     if calibration.lens == "estimated" and "stated" in calibration.lenses:
-        left = math.degrees(calibration.stated_left_rad)
+        left = calibration.stated_left_rad
         yield (
             "  intrinsics   the pose is for the estimated ones; 'evercal export' turns it for the"
-            f" stated ones, which leave {left:.3f} deg that no pose explains"
+            f" stated ones, which leave {math.degrees(left):.3f} deg that no pose explains,"
+            f" {500 * left:.2f} mm at 0.5 m"
         )
 
 

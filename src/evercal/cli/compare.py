@@ -41,12 +41,8 @@ class Compare(args.Verb):
 
         first = calibration_at(self.first)
         compared = first.distance(calibration_at(self.second), self.distance)
-        notes = map("  note         {}".format, compared.notes)
-        self.answer(
-            compared.to_dict(),
-            *_LINES.format(compared, ", ".join(compared.shared) or "nothing").split(
-                "\n"
-            ),
-            *notes,
-        )
+        shared = ", ".join(compared.shared) or "nothing"
+        lines = _LINES.format(compared, shared).splitlines()
+        lines += map("  note         {}".format, compared.notes)
+        self.answer(compared.to_dict(), *lines)
         return 0 if compared.agree else 1
