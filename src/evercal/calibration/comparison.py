@@ -211,4 +211,5 @@ def _cause(first: FramedPose, error: Array, covariance: Array) -> str:
 
 
 def _spread(values: Array) -> tuple[float, float]:
-    return float(np.median(values)), float(np.quantile(values, 0.9))
+    median, most = np.quantile(values, (0.5, 0.9)).tolist()
+    return median, most

@@ -34,7 +34,7 @@ class Export(args.Verb):
     """Format, such as easy_handeye2, urdf, opencv or kuka; `list` lists all."""
     out: args.File = None
     """File to write; a new folder for colmap."""
-    lens: Annotated[Path | None, args.shown("stated|estimated|FILE")] = None
+    lens: Annotated[str | None, args.shown("stated|estimated|FILE")] = None
     """Intrinsics of the program that takes the pose: those stated with the images, the estimated
     ones, which are then written beside it, or a camera file. Default: the stated ones, if any."""
     parent: args.Frame = None
@@ -85,8 +85,6 @@ class Export(args.Verb):
         if self.calibration is None:
             raise InputError("no calibration given; name its JSON file after 'export'")
         options = {key: getattr(self, key) for key in ExportOptions.__annotations__}
-        if self.lens is not None:
-            options["lens"] = str(self.lens)
         calibration = calibration_at(self.calibration)
         exported = export_files(calibration, self.format, self.out, **options)
         self._show(exported, calibration.verdict)
