@@ -233,7 +233,7 @@ class Calibration(FramedPose):
             for checks in (self.checks, other.checks):
                 if checks.image_scatter:
                     scatter = np.array(checks.image_scatter)
-                    measured.append((scatter, int(checks.images_used or 1)))
+                    measured.append((scatter, checks.images_used or 1))
         distance_m = distance_m or self.checks.target_m or other.checks.target_m
         return compare(self, other, distance_m, measured)
 

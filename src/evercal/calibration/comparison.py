@@ -131,10 +131,11 @@ def compare(
     behind = a.rotation.apply(own)
     ahead = b.rotation.apply(other)
     points = shift + distance * (ahead - behind)
-    d2 = float(error @ np.linalg.pinv(covariance) @ error)
+    information = np.linalg.pinv(covariance)
+    d2 = float(error @ information @ error)
     cause = ""
     if d2 > LIMIT:
-        cause = _cause(first, error, covariance)
+        cause = _cause(first, error, information)
     return Comparison(
         distance,
         _spread(np.rad2deg(angles(behind, ahead))),
@@ -192,7 +193,7 @@ def _shared(first: FramedPose, second: FramedPose) -> tuple[str, ...]:
     return tuple(shared)
 
 
-def _cause(first: FramedPose, error: Array, covariance: Array) -> str:
+def _cause(first: FramedPose, error: Array, information: Array) -> str:
     """The cause whose directions explain the difference (6,) with the fewest parameters."""
     rotation = first.parent_from_child.rotation_matrix()
     axis = np.array([0.0, 0.0, 1.0])
@@ -201,7 +202,6 @@ def _cause(first: FramedPose, error: Array, covariance: Array) -> str:
     joint = np.concatenate([lever, rotation[2]])
     six = np.eye(6)
     directions = (along[:, None], joint[:, None], six[:, 3:], six[:, :3], six)
-    information = np.linalg.pinv(covariance)
     scores = []
     for basis in directions:
         weighted = basis.T @ information

@@ -168,8 +168,7 @@ def _from_given(
     """Distance from a given transform, which is taken to be for the stated intrinsics."""
     if given is None:
         return None, None
-    stated = calibration.for_lens("stated")
-    return pose_distance_mm_deg(stated.parent_from_child, given)
+    return pose_distance_mm_deg(calibration.for_program().parent_from_child, given)
 
 
 def verdict_of(calibration: Calibration, warnings: Sequence[str], advice: str) -> str:
