@@ -34,6 +34,7 @@ from evercal.calibration.pose_pairs.pairs import (
     middle_of,
 )
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation, Unknowns
+from evercal.calibration.pose_pairs.second_group import second_group
 from evercal.calibration.pose_pairs.slips import Slip, find_slip
 from evercal.calibration.pose_pairs.solution import PairSolution
 from evercal.calibration.pose_pairs.starts import quick_fit
@@ -132,7 +133,9 @@ def solve_pose_pairs(
     warnings: list[str] = []
     if scale_known:
         equation, fit, warnings = with_tested_size(equation, fit, corners, of_board)
-    if slip is not None:
+    if slip is None:
+        warnings += second_group(equation, fit, rows, pairs.names)
+    else:
         fit = replace(fit, covariance=fit.covariance + slip.spread)
         warnings.append(_slip_warning(slip, pairs.names, of_board))
     if corners is not None and lens is not None:
@@ -207,8 +210,9 @@ def _slip_warning(
         what = what.replace("board", "map")
     return (
         f"the {what} looks moved by {1000 * slip.metres:.1f} mm and"
-        f" {np.rad2deg(slip.radians):.2f} deg before {names[slip.row]}, or the arm"
-        " drifts: calibrate from the poses before or after it, or fasten it and record again"
+        f" {np.rad2deg(slip.radians):.2f} deg before {names[slip.row]}, or the"
+        " robot's base, or the arm drifts: calibrate from the poses before or after it, or fasten it"
+        " and record again"
     )
 
 
