@@ -71,8 +71,8 @@ _UNITS = {0.001: "millimetres", 0.01: "centimetres", 0.0254: "inches"}
 """Names of units, by metres."""
 _CAUSES = (
     "check that each row belongs to its image, that the robot stood still, which frames the poses"
-    " connect, their Euler or quaternion order, that the camera was fixed firmly, and that its focal"
-    " length and distortion are right"
+    " connect, their Euler or quaternion order, that the camera was fixed firmly, and that its"
+    " focal length and distortion are right"
 )
 
 

@@ -142,8 +142,7 @@ def solve_pose_pairs(
         warnings += corner_warnings(fit, equation, corners, lens)
     if of_board:
         warnings += _mount_warnings(fit.at, mount)
-    used = pairs[rows[fit.inliers]]
-    _require_determined(used, fit, equation, scale_known)
+    _require_determined(pairs[rows[fit.inliers]], fit, equation, scale_known)
     return PairSolution(
         pairs=pairs,
         rows=rows,
@@ -211,8 +210,8 @@ def _slip_warning(
     return (
         f"the {what} looks moved by {1000 * slip.metres:.1f} mm and"
         f" {np.rad2deg(slip.radians):.2f} deg before {names[slip.row]}, or the"
-        " robot's base, or the arm drifts: calibrate from the poses before or after it, or fasten it"
-        " and record again"
+        " robot's base, or the arm drifts: calibrate from the poses before or after it, or fasten"
+        " it and record again"
     )
 
 
