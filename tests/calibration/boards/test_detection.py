@@ -10,8 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.board import Board
-from evercal.calibration.boards.corners import BoardView, board_pose
+from evercal.calibration.boards.corners import BoardView, Detection, board_pose
 from evercal.calibration.boards.detection import find_board, find_boards
+from evercal.calibration.boards.marker_layout import OtherSize
+from evercal.calibration.boards.markers import CharucoView, sizes_pooled
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 
@@ -307,3 +309,20 @@ def test_an_image_that_cannot_be_read_keeps_its_reason_beside_a_grid() -> None:
     _, views = find_boards(list(images), images.__getitem__, APRILGRID)
     assert views["bad"] == "not an image"
     assert isinstance(views["good"], BoardView)
+
+
+@pytest.mark.parametrize(("doubted", "refused"), [(5, False), (9, True)])
+def test_the_size_of_markers_is_judged_by_most_images(
+    doubted: int, refused: bool
+) -> None:
+    points = np.eye(4, 3)
+    views: dict[str, Detection] = {}
+    for i in range(16):
+        other = OtherSize("markers measure 17 mm") if i < doubted else ""
+        views[str(i)] = CharucoView(points, points[:, :2], other)
+    views["dark"] = "no corners"
+    pooled = sizes_pooled(views)
+    reasons = [name for name, view in pooled.items() if isinstance(view, OtherSize)]
+    assert len(reasons) == (doubted if refused else 0)
+    assert pooled["dark"] == "no corners"
+    assert isinstance(pooled["15"], BoardView)

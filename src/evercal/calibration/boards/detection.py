@@ -14,6 +14,7 @@ from evercal.calibration.boards.markers import (
     find_markers,
     find_tag,
     grid_views,
+    sizes_pooled,
 )
 from evercal.errors import InputError
 from evercal.geometry.camera import resize_pixels
@@ -111,7 +112,7 @@ def _settled(
         else:
             views[name] = detection
     if not markers:
-        return board, views
+        return board, sizes_pooled(views)
     settled, of_grid = grid_views(markers, board)
     return settled, of_grid | views
 

@@ -39,6 +39,10 @@ class OtherBoard(str):
     """A reason that names a board in the image that is not the stated one."""
 
 
+class OtherSize(OtherBoard):
+    """The reason for markers of another size, which a few images may show by chance."""
+
+
 class Markers(NamedTuple):
     """n markers in an image, and m steps from each to its neighbours in the image."""
 
@@ -171,7 +175,7 @@ def _other_size(board: Board, side: float) -> "OtherBoard":
     """Return the reason for markers whose side, in cells, contradicts the stated sizes."""
     size_mm = 1000 * board.size_m
     if board.kind == "charuco":
-        return OtherBoard(
+        return OtherSize(
             f"markers measure {size_mm * side:.3g} mm beside squares of {size_mm:g} mm, not"
             f" {1000 * board.marker_m:g}; correct `marker_mm`"
         )

@@ -1,7 +1,7 @@
 """Detect boards of markers: tags, grids and ChArUco boards."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -13,6 +13,7 @@ from evercal.calibration.boards.marker_layout import (
     SQUARE,
     MarkerLayout,
     Markers,
+    OtherSize,
     Plane,
     layout_of,
 )
@@ -26,6 +27,23 @@ _MIN_CORNERS = 6
 """Minimum number of ChArUco corners."""
 _NEAREST = 4
 """Number of neighbours of a marker that are compared."""
+
+
+@dataclass(frozen=True, eq=False)
+class CharucoView(BoardView):
+    """Corners of a ChArUco board, and what is wrong with the size of its markers."""
+
+    other: str = ""
+    """Empty for markers of the stated size."""
+
+
+def sizes_pooled(views: Mapping[str, Detection]) -> dict[str, Detection]:
+    """Refuse markers of another size where most images show it."""
+    of_charuco = [view for view in views.values() if isinstance(view, CharucoView)]
+    doubted = sum(bool(view.other) for view in of_charuco)
+    if 2 * doubted <= len(of_charuco):
+        return dict(views)
+    return {name: getattr(view, "other", "") or view for name, view in views.items()}
 
 
 def find_markers(grey: Image, board: Board) -> Markers:
@@ -144,7 +162,7 @@ def find_charuco(grey: Image, board: Board) -> Detection:
     """Detect the corners of squares of a ChArUco board, or return a reason."""
     markers = find_markers(grey, board)
     layout, other = layout_of(markers, board)
-    if other:
+    if other and not isinstance(other, OtherSize):
         return other
     size = (board.columns, board.rows)
     dictionary = dictionary_of(board)
@@ -165,7 +183,8 @@ def find_charuco(grey: Image, board: Board) -> Detection:
         points = chessboard[ids]
         extents = np.linalg.svd(points - points.mean(0), compute_uv=False)
         if extents[1] > 0.5 * board.size_m:
-            return sharpened(grey, BoardView(points, pixels), board)
+            view = sharpened(grey, BoardView(points, pixels), board)
+            return CharucoView(view.points_m, view.pixels, other)
     return (
         f"{len(ids)} corners of the ChArUco board; {_MIN_CORNERS} in two rows are required; check"
         f" `size` (squares), `dictionary` ({board.dictionary}), light and focus"
