@@ -13,7 +13,11 @@ from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.corners import BoardView, Detection, board_pose
 from evercal.calibration.boards.detection import find_board, find_boards
 from evercal.calibration.boards.marker_layout import OtherSize
-from evercal.calibration.boards.markers import CharucoView, sizes_pooled
+from evercal.calibration.boards.markers import (
+    CharucoView,
+    other_dictionary,
+    sizes_pooled,
+)
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 
@@ -326,3 +330,11 @@ def test_the_size_of_markers_is_judged_by_most_images(
     assert len(reasons) == (doubted if refused else 0)
     assert pooled["dark"] == "no corners"
     assert isinstance(pooled["15"], BoardView)
+
+
+def test_another_dictionary_that_fits_is_named() -> None:
+    images = {str(i): photographed(TAG, view_of(TAG, i)) for i in range(4)}
+    other = replace(TAG, dictionary="5X5_50")
+    with pytest.raises(InputError, match=f"give `dictionary` {TAG.dictionary}"):
+        find_boards(list(images), images.__getitem__, other)
+    assert other_dictionary(list(images.values()), TAG) == ""

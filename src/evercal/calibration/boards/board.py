@@ -123,14 +123,24 @@ class Board:
             raise ValueError(f"'board' is invalid ({error})") from None
 
 
+def dictionaries() -> list[str]:
+    """Names of the dictionaries of markers, the small ones of each family first."""
+    import cv2
+
+    names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
+    # Of two spellings, 36h11 before 36H11.
+    names.sort(key=lambda name: (getattr(cv2.aruco, name), name.swapcase()))
+    return [name.removeprefix("DICT_") for name in names]
+
+
 def dictionary_of(board: Board) -> Any:
     """Return the dictionary of markers of a board."""
     import cv2
 
     code = getattr(cv2.aruco, f"DICT_{board.dictionary}", None)
     if code is None:
-        names = sorted(key[5:] for key in dir(cv2.aruco) if key.startswith("DICT_"))
+        names = ", ".join(sorted(dictionaries()))
         raise InputError(
-            f"dictionary {board.dictionary!r} is not known; use one of {', '.join(names)}"
+            f"dictionary {board.dictionary!r} is not known; use one of {names}"
         )
     return cv2.aruco.getPredefinedDictionary(code)

@@ -14,6 +14,7 @@ from evercal.calibration.boards.markers import (
     find_markers,
     find_tag,
     grid_views,
+    other_dictionary,
     sizes_pooled,
 )
 from evercal.errors import InputError
@@ -26,6 +27,8 @@ _MAX_DOUBLED_PX = 1400
 """Maximum width of an image that is searched again at double size."""
 _FEW_IMAGES = 4
 """Number of images that show another board, after which a search ends."""
+_HINT_IMAGES = 3
+"""Number of images in which markers of other dictionaries are searched then."""
 _MANY_IMAGES = 20
 """Number of images without any board, after which a search ends."""
 
@@ -59,31 +62,38 @@ def find_boards(
         early = tried <= _MANY_IMAGES and tried % _FEW_IMAGES == 0
         if last or early:
             settled, views = _settled(found, board)
-            _require_board(views, len(names))
+            reason = _no_board(views, len(names))
+            if reason and any(isinstance(view, OtherBoard) for view in views.values()):
+                raise InputError(reason)
+            if reason:
+                images = [read(names[k]) for k in order[:_HINT_IMAGES]]
+                shown = [image for image in images if not isinstance(image, str)]
+                raise InputError(reason + other_dictionary(shown, board))
     return settled, {name: views[name] for name in names}
 
 
-def _require_board(
+def _no_board(
     views: Mapping[str, Detection],
     count: int,
-) -> None:
-    """Refuse `count` images if all, many or a few of another board were searched in vain."""
+) -> str:
+    """Reason to refuse `count` images: all, many or a few of another board were searched in vain.
+
+    It is empty otherwise.
+    """
     others = []
     for name, view in views.items():
         if isinstance(view, BoardView):
-            return
+            return ""
         if isinstance(view, OtherBoard):
             others.append(name)
     tried = len(views)
     if len(others) < _FEW_IMAGES and tried not in (_MANY_IMAGES, count):
-        return
+        return ""
     name = [*others, *views][0]
     spread = ""
     if tried < count:
         spread = f", spread over {count}"
-    raise InputError(
-        f"no board in any of {tried} images{spread} ({name}: {views[name]})"
-    )
+    return f"no board in any of {tried} images{spread} ({name}: {views[name]})"
 
 
 def _look(

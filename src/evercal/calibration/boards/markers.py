@@ -1,12 +1,12 @@
 """Detect boards of markers: tags, grids and ChArUco boards."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from evercal.calibration.boards.board import Board, dictionary_of
+from evercal.calibration.boards.board import Board, dictionaries, dictionary_of
 from evercal.calibration.boards.corners import BoardView, Detection
 from evercal.calibration.boards.edges import sharpened, squares_by_their_sides
 from evercal.calibration.boards.marker_layout import (
@@ -44,6 +44,29 @@ def sizes_pooled(views: Mapping[str, Detection]) -> dict[str, Detection]:
     if 2 * doubted <= len(of_charuco):
         return dict(views)
     return {name: getattr(view, "other", "") or view for name, view in views.items()}
+
+
+def other_dictionary(images: Sequence[Image], board: Board) -> str:
+    """Return a hint at the dictionary whose markers most images show, if it is not the stated one.
+
+    `images` are (H, W, 3).
+    """
+    if board.kind == "chessboard":
+        return ""
+    best = board.dictionary
+    most = 0
+    for name in dictionaries():
+        detector = cv2.aruco.ArucoDetector(
+            dictionary_of(replace(board, dictionary=name))
+        )
+        found = [detector.detectMarkers(image)[1] for image in images]
+        counts = [0 if ids is None else len(ids) for ids in found]
+        if np.median(counts) >= 1 and sum(counts) > most:
+            best = name
+            most = sum(counts)
+    if best == board.dictionary:
+        return ""
+    return f"; markers of {best} are visible: give `dictionary` {best}"
 
 
 def find_markers(grey: Image, board: Board) -> Markers:
