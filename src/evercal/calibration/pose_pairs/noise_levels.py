@@ -1,20 +1,22 @@
 """Noise of the hand-eye equation, and the sizes of its kinds by restricted maximum likelihood.
 
 Residuals are smaller than the noise, because the fit follows part of it: H. Patterson and
-R. Thompson, Recovery of inter-block information, 1971. Errors that poses share make the covariance
-of the residuals dense. It is the sum of a block of each pose and a matrix of low rank, and is
-inverted as such (M. Woodbury, Inverting modified matrices, 1950).
+R. Thompson, Recovery of inter-block information, 1971.
 """
 
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg import block_diag, cho_solve, solve_triangular
+from scipy.linalg import block_diag
 from scipy.optimize import minimize
-from scipy.stats import chi2, f, norm
+from scipy.stats import chi2, f
 
 from evercal.calibration.pose_pairs.pose_equation import System
-from evercal.geometry.normal_equations import normal_inverse
+from evercal.robot.shared_noise import (
+    SharedNoise,
+    mean_variances,
+    variance_uncertainty,
+)
 from evercal.typing import Array
 
 FLOOR = np.diag([1e-14] * 6)
@@ -31,64 +33,21 @@ _PRECISION = 1e-5
 _PSEUDO = 1.0
 """Number of pseudo-residuals of each independent kind, as large as all residuals together: without
 them, few poses have a likelihood that is largest where one kind is zero and fits exactly."""
-_AT_ZERO = 0.3
-"""Mean of a variance whose likelihood falls from zero on like that of a normal variable, by the
-mean of the positive half of that variable; the standard deviation has a flat prior."""
 _COVERAGE = 0.95
 """Coverage of the ellipsoids that `ellipsoid_factor` widens."""
-_LEAST_LEFT = 0.5
-"""Share of a variance that is left at least."""
-_RIDGE = 1e-9
-"""Share by which kinds of noise differ at least."""
-_NOTHING_SEEN = 2 * (_AT_ZERO * np.sqrt(2 / np.pi)) ** 2
-"""Information on a variance without any residual, by which its mean is that of the prior."""
 
 
-class Noise:
+class Noise(SharedNoise):
     """Covariance of the residuals (n, 6) of a system, by the variances of its kinds."""
 
     def __init__(self, system: System, variance: Array) -> None:
-        n = len(system.residual)
         count = len(system.directions)
         own = np.tensordot(variance[:count], _spreads(system), 1)
-        self.independent = system.known + FLOOR + own
-        """(n, 6, 6) of errors that no other pose shares."""
-        parts = [np.zeros((n, 6, 0))]
-        sizes = np.sqrt(variance[count:])
-        for size, kind in zip(sizes, system.shared.values(), strict=True):
-            parts.append(size * kind.slopes)
-        self.shared = np.concatenate(parts, 2)
-        """(n, 6, r) residuals by the effects of all kinds that poses share; their covariance is
-        the identity before the residuals are known."""
-        self._information = np.linalg.inv(self.independent)
-        rank = self.shared.shape[2]
-        weighted = (self._information @ self.shared).reshape(6 * n, rank)
-        inner = self.shared.reshape(6 * n, rank).T @ weighted
-        inner.flat[:: rank + 1] += 1.0
-        self._root = np.linalg.cholesky(inner)
-        half = solve_triangular(self._root, weighted.T, lower=True, check_finite=False)
-        self._half = half.T
-
-    def weighted(self, values: Array) -> Array:
-        """Multiply (n, 6, m) by the inverse covariance."""
-        m = values.shape[2]
-        own = self._information @ values
-        shared = self._half @ (self._half.T @ values.reshape(len(self._half), m))
-        return own - shared.reshape(own.shape)
-
-    def blocks(self) -> Array:
-        """(n, 6, 6) blocks of the inverse covariance."""
-        half = self._half.reshape(len(self.independent), 6, -1)
-        return self._information - half @ half.transpose(0, 2, 1)
-
-    def unexplained(self) -> Array:
-        """(r, r) covariance of the effects, if all other unknowns were known."""
-        return cho_solve((self._root, True), np.eye(len(self._root)))
-
-    def logarithm(self) -> float:
-        """Logarithm of the determinant of the covariance."""
-        own = np.linalg.slogdet(self.independent)[1].sum()
-        return float(own + 2 * np.log(np.diag(self._root)).sum())
+        super().__init__(
+            system.known + FLOOR + own,
+            variance[count:],
+            system.shared,
+        )
 
 
 def clipped_inverse(normal: Array) -> Array:
@@ -164,41 +123,22 @@ def ellipsoid_factor(
 
 
 def mean_levels(system: System, variance: Array) -> Array:
-    """Mean of each variance (k,), given that where its likelihood is largest.
-
-    They differ where the likelihood is largest near zero: what the residuals do not exclude.
-    """
-    spread = level_uncertainty(system, variance)
-    sigma = np.sqrt(np.diag(spread))
-    ratio = np.minimum(variance / sigma, 30.0)
-    excess = _AT_ZERO * sigma * norm.pdf(ratio) / norm.cdf(ratio)
-    # A kind that grows takes from kinds that look like it.
-    return np.maximum(variance + spread @ (excess / sigma**2), _LEAST_LEFT * variance)
+    """Mean of each variance (k,), given that where its likelihood is largest."""
+    return mean_variances(variance, level_uncertainty(system, variance))
 
 
 def level_uncertainty(system: System, variance: Array) -> Array:
     """(k, k) covariance of the variances, by their expected information."""
     noise = Noise(system, variance)
+    rows = system.residual.size
     weighted = noise.weighted(system.jacobian)
     factor, _ = _factor(normal_matrix(system, weighted))
-    rows = system.residual.size
-    kinds: list[Array] = []
+    explained = (weighted @ factor).reshape(rows, -1)
+    kinds = []
     for directions in system.directions.values():
         kinds.append(np.asarray(block_diag(*directions)))
-    for kind in system.shared.values():
-        kinds.append(kind.slopes.reshape(rows, -1))
-    effects = np.concatenate(kinds, 1)
-    weighted_effects = noise.weighted(effects.reshape(*system.residual.shape, -1))
-    by_fit = factor.T @ (weighted.reshape(rows, -1).T @ effects)
-    between = effects.T @ weighted_effects.reshape(rows, -1) - by_fit.T @ by_fit
-    # Which effects are of which kind.
-    ranks = [kind.shape[1] for kind in kinds]
-    member = np.eye(len(kinds))[np.repeat(np.arange(len(kinds)), ranks)]
-    information = member.T @ between**2 @ member
-    count = len(system.directions)
-    for k, kind in enumerate(system.shared.values(), count):
-        information[k, k] += _NOTHING_SEEN / kind.usual**4
-    return 2 * normal_inverse(information, _RIDGE)
+    pull = noise.inverse() - explained @ explained.T
+    return variance_uncertainty(pull, kinds, system.shared)
 
 
 def _likelihood(logarithms: Array, system: System, first: Array) -> tuple[float, Array]:
