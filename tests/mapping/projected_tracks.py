@@ -10,6 +10,7 @@ from evercal.geometry import SE3, Camera, pose_distance
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment
 from evercal.mapping.bundle_equations import BundleTracks
 from evercal.mapping.bundle_options import BundleOptions
+from evercal.mapping.stated_errors import StatedErrors
 from evercal.simulation.box_room import look_at
 from evercal.typing import Array
 
@@ -94,7 +95,8 @@ def problem(
     if velocity is None:
         velocity = np.zeros((len(stated), 6))
     cameras = [camera] * len(stated)
-    return BundleAdjustment(stated, cameras, velocity, options or BundleOptions())
+    errors = StatedErrors(velocity)
+    return BundleAdjustment(stated, cameras, errors, options or BundleOptions())
 
 
 def adjusted(

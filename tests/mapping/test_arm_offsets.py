@@ -11,6 +11,7 @@ from evercal.geometry import SE3
 from evercal.mapping.arm_offsets import joint_slopes, with_offsets
 from evercal.mapping.build import MapOptions
 from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment
+from evercal.mapping.stated_errors import StatedErrors
 from evercal.recordings.frame import Frame
 from evercal.robot.arm import Arm, MovingJoint
 from evercal.robot.arm_offsets import ArmOffsets
@@ -79,10 +80,12 @@ def adjusted(
     return BundleAdjustment(
         restated,
         [CAMERA] * FRAMES,
-        np.zeros((FRAMES, 6)),
+        StatedErrors(
+            np.zeros((FRAMES, 6)),
+            SE3.stack([camera] * FRAMES) if wrist else restated,
+            joint_slopes(frames, begun),
+        ),
         options,
-        SE3.stack([camera] * FRAMES) if wrist else restated,
-        joint_slopes(frames, begun),
     ).solve(made.tracks)
 
 

@@ -15,6 +15,7 @@ from evercal.mapping.built_map import of_rays
 from evercal.mapping.bundle_adjustment import BundleAdjustment
 from evercal.mapping.bundle_equations import COMMON, SHARED, Parameters
 from evercal.mapping.bundle_options import BundleOptions
+from evercal.mapping.stated_errors import StatedErrors
 from evercal.mapping.variance_components import noise_of
 from evercal.typing import Array
 
@@ -30,6 +31,9 @@ from .projected_tracks import (
     without_gauge,
     world,
 )
+
+STILL = StatedErrors(np.zeros((FRAMES, 6)))
+"""Cameras whose poses are stated."""
 
 
 def test_exact_poses_do_not_change() -> None:
@@ -108,7 +112,7 @@ def test_systematic_errors_of_an_arm_widen_the_covariance(systematic: bool) -> N
     errors = rng.normal(0, sigma, (FRAMES, 6))
     errors += 3 * systematic * linear @ rng.normal(0, sigma, (6, 6))
     result = BundleAdjustment(
-        made.truth @ SE3.exp(errors), [CAMERA] * FRAMES, np.zeros((FRAMES, 6)), options
+        made.truth @ SE3.exp(errors), [CAMERA] * FRAMES, STILL, options
     ).solve(made.tracks)
     ratio = np.trace(result.common_systematic) / np.trace(result.common_covariance)
     assert ratio > 1 if systematic else ratio < 1
@@ -125,12 +129,14 @@ def test_an_arm_errs_at_the_gripper() -> None:
     errors = rng.normal(0, np.repeat([2e-4, np.deg2rad(0.2)], 3), (FRAMES, 6))
     grippers = made.truth @ gripper_from_camera.inverse()
     stated = grippers @ SE3.exp(errors) @ gripper_from_camera
-    still = np.zeros((FRAMES, 6))
-    at_camera = BundleAdjustment(stated, [CAMERA] * FRAMES, still, options).solve(
+    at_camera = BundleAdjustment(stated, [CAMERA] * FRAMES, STILL, options).solve(
         made.tracks
     )
     problem = BundleAdjustment(
-        stated, [CAMERA] * FRAMES, still, options, gripper_from_camera
+        stated,
+        [CAMERA] * FRAMES,
+        StatedErrors(np.zeros((FRAMES, 6)), gripper_from_camera),
+        options,
     )
     at_gripper = problem.solve(made.tracks)
     assert at_gripper.sigma_m < 5e-4
@@ -170,9 +176,7 @@ def test_focal_length_is_estimated(factor: float) -> None:
     fixed = adjusted(made, made.truth, wrong, options=BundleOptions(intrinsics=False))
     assert fixed.cameras is None
     several = [wrong, *[CAMERA] * (FRAMES - 1)]
-    mixed = BundleAdjustment(
-        made.truth, several, np.zeros((FRAMES, 6)), BundleOptions()
-    )
+    mixed = BundleAdjustment(made.truth, several, STILL, BundleOptions())
     assert mixed.solve(made.tracks).cameras is None
 
 

@@ -32,7 +32,7 @@ from evercal.mapping.pose_readings import require_consistent
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
 from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import select_farthest, spread_poses
-from evercal.mapping.stated_errors import velocity_of
+from evercal.mapping.stated_errors import StatedErrors, velocity_of
 from evercal.mapping.tracks import (
     SWEPT_FRAMES,
     KeyframeTracks,
@@ -45,6 +45,7 @@ from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, stated_grippers, stated_poses
 from evercal.robot.arm_offsets import ArmOffsets
 from evercal.robot.mount import Mount
+from evercal.robot.pose_errors import ArmErrors, shared_errors
 from evercal.typing import Array, IntArray
 
 HAND_EYE_COVARIANCE_SCALE = 2.5
@@ -86,6 +87,8 @@ class MapOptions:
     """Mount of a camera whose poses follow from those of a gripper; see `for_hand_eye`."""
     whole: Camera | None = None
     """Intrinsics of whole images, where the frames are windows of them."""
+    errors: ArmErrors = field(default_factory=ArmErrors)
+    """What is known of the arm that moves the gripper."""
 
     def __post_init__(self) -> None:
         """Refuse numbers outside their range.
@@ -223,6 +226,10 @@ def _adjust(
     arm = options.arm
     joints = None
     adjustment = None
+    kinds = None
+    # Stated joint values show their offsets better than poses.
+    if options.mount is not None and arm is None:
+        kinds = shared_errors(stated_grippers(prepared.frames), options.errors)
     for number in range(options.rounds):
         on_progress("adjusting", number, options.rounds)
         tracks = bundle_tracks(prepared, keyframes)
@@ -231,10 +238,13 @@ def _adjust(
         problem = BundleAdjustment(
             prepared.stated,
             stated_cameras,
-            velocity,
+            StatedErrors(
+                velocity,
+                _gripper_from_camera(prepared, options.mount),
+                joints,
+                kinds,
+            ),
             options.bundle,
-            _gripper_from_camera(prepared, options.mount),
-            joints,
         )
         adjustment = problem.solve(tracks)
         prepared.adjust(adjustment.poses, adjustment.cameras)

@@ -31,15 +31,16 @@ from evercal.mapping.bundle_equations import (
     StatedFrames,
 )
 from evercal.mapping.bundle_options import FIXED, BundleOptions
+from evercal.mapping.shared_levels import shared_levels
 from evercal.mapping.stated_errors import StatedErrors, Variances
 from evercal.mapping.variance_components import (
+    by_shared,
     noise_of,
     pose_sigma,
     shared_variances,
     student_weights,
     systematic_covariance,
 )
-from evercal.robot.arm_offsets import JointSlopes
 from evercal.typing import Array, BoolArray
 
 INVALID_SQUARES = 1e8
@@ -62,6 +63,8 @@ DETERMINED = 0.05
 """An offset is determined if its variance by the images alone is below this share of its prior."""
 MIN_INFORMATION = 1e-9
 """Lower bound of the information of the images on an offset, which is a divisor."""
+SHARED_STEPS = 3
+"""Steps after errors that stated poses share are taken in."""
 CONVERGED = 1e-9
 """Adjustment ends when a step is this small, in standard deviations, and variances change by less
 than this share."""
@@ -138,23 +141,21 @@ class BundleAdjustment:
     """The problem of one recording.
 
     Cameras are those of the image size that patches are cut from, and adjusted if all are the same
-    but for the principal point. For velocity, `gripper_from_camera` and joints see `StatedErrors`.
+    but for the principal point.
     """
 
     def __init__(
         self,
         stated: SE3,
         cameras: list[Camera],
-        velocity: Array,
+        errors: StatedErrors,
         options: BundleOptions,
-        gripper_from_camera: SE3 | None = None,
-        joints: JointSlopes | None = None,
     ):
         self.options = options
-        self.errors = StatedErrors(velocity, gripper_from_camera, joints)
-        self.n = self.errors.n
+        self.errors = errors
+        self.n = errors.n
         self.frames = StatedFrames(stated, cameras)
-        self.moves = bool(np.abs(velocity).max(initial=0) > 0)
+        self.moves = bool(np.abs(errors.motion[:, :, COMMON]).max(initial=0) > 0)
         """Whether a time shift has an effect."""
         self.camera = cameras[0]
         self.adjusts_camera = options.intrinsics and self.frames.same_lens
@@ -181,7 +182,28 @@ class BundleAdjustment:
                 variances = replace(variances, shared=shared)
             if estimate.step < CONVERGED and variances.close_to(before, CONVERGED):
                 break
+        if self.errors.kinds:
+            estimate, variances = self._with_shared(tracks, estimate, variances)
         return self._result(tracks, estimate, variances)
+
+    def _with_shared(
+        self, tracks: BundleTracks, estimate: Estimate, variances: Variances
+    ) -> tuple[Estimate, Variances]:
+        """Adjust again with errors that stated poses share, where the images ask for them."""
+        levels = shared_levels(
+            self.errors.at_origin(estimate.parameters),
+            self.errors.of_rows(estimate.root),
+            variances.weight,
+            variances.sigma,
+            self.errors.kinds,
+        )
+        if levels is None:
+            return estimate, variances
+        sigma = np.sqrt(np.repeat(levels[:2], 3))
+        variances = replace(variances, sigma=sigma, of_kinds=levels[2:])
+        for _ in range(SHARED_STEPS):
+            estimate = self.step(tracks, estimate, variances)
+        return estimate, variances
 
     def start(self, tracks: BundleTracks) -> Estimate:
         """The stated values."""
@@ -265,7 +287,8 @@ class BundleAdjustment:
         squares[~linearised.valid] = INVALID_SQUARES
         data = np.log1p(squares / noise**2).sum() / self.options.correlation**2
         errors = self.errors.at_origin(estimate.parameters)
-        poses = variances.weight[:, None] * (errors / variances.sigma) ** 2
+        noise_of_poses = self.errors.noise(variances)
+        poses = errors * noise_of_poses.weighted(errors[..., None])[..., 0]
         shared = estimate.parameters.shared**2 / variances.shared
         return float(data + poses.sum() + shared.sum())
 
@@ -347,14 +370,19 @@ class BundleAdjustment:
         by_pose = [root[:, 6 * i : 6 * i + 6] for i in range(n)]
         shared = root[:, 6 * n :]
         with_lens = np.r_[:COMMON, -INTRINSICS:0]
-        systematic = systematic_covariance(
-            self.frames.stated,
-            self.errors,
-            parameters,
-            root,
-            variances,
-            self.options.least_systematic,
-        )
+        whole = shared[:, with_lens].T @ shared[:, with_lens]
+        if len(variances.of_kinds):
+            systematic = by_shared(self.errors, root, variances)
+            whole = whole - systematic[np.ix_(with_lens, with_lens)]
+        else:
+            systematic = systematic_covariance(
+                self.frames.stated,
+                self.errors,
+                parameters,
+                root,
+                variances,
+                self.options.least_systematic,
+            )
         joints = self.errors.offsets
         offsets = shared[:, joints].T @ shared[:, joints]
         prior = variances.shared[joints]
@@ -368,7 +396,7 @@ class BundleAdjustment:
             sigma_m=float(variances.sigma[0]),
             sigma_rad=float(variances.sigma[3]),
             residual_px=float(np.median(residual_px)),
-            lens_covariance=shared[:, with_lens].T @ shared[:, with_lens],
+            lens_covariance=whole,
             lens_systematic=systematic[np.ix_(with_lens, with_lens)],
             correction=self.errors.of_cameras(parameters),
             errors=self.errors.at_origin(parameters),

@@ -22,6 +22,7 @@ from evercal.mapping.pose_check import scale_of_depths
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
 from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import PoseSpace, select_farthest
+from evercal.mapping.stated_errors import StatedErrors
 from evercal.mapping.tracks import (
     REACH_PX,
     WIDE_STEPS,
@@ -301,9 +302,9 @@ def _adjust(
     old = [keyframe for keyframe in tracks if len(keyframe.landmarks)]
     observed = bundle_tracks(prepared, [*old, *opened])
     stated = prepared.stated
-    problem = BundleAdjustment(
-        stated, list(prepared.cameras), np.zeros((len(stated), 6)), options.bundle
-    )
+    still = StatedErrors(np.zeros((len(stated), 6)))
+    cameras = list(prepared.cameras)
+    problem = BundleAdjustment(stated, cameras, still, options.bundle)
     poses = problem.solve(observed).poses
     # The old keyframes define the frame: undo their mean motion.
     poses = average_poses(stated[:count] @ poses[:count].inverse()) @ poses

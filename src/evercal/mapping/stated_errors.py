@@ -3,7 +3,8 @@
 A correction of a pose is what the parameters common to all frames explain, and an error of its own.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from evercal.mapping.bundle_equations import (
     Parameters,
 )
 from evercal.robot.arm_offsets import JointSlopes
+from evercal.robot.pose_errors import SharedErrors
+from evercal.robot.shared_noise import SharedNoise
 from evercal.typing import Array
 
 LONG_STEP = 4
@@ -32,6 +35,8 @@ class Variances:
     """(n,) weights of the stated poses."""
     shared: Array
     """(15 + k,) variances of the shared parameters."""
+    of_kinds: Array = field(default_factory=lambda: np.zeros(0))
+    """Variances of the kinds of errors that stated poses share; none before they are estimated."""
 
     def close_to(self, other: "Variances", tolerance: float) -> bool:
         """Whether two priors differ by less than this share."""
@@ -47,7 +52,7 @@ class StatedErrors:
     The velocity (n, 6) is the motion from frame to frame, camera frame, metres and radians; 0 if
     unknown. With `gripper_from_camera` (n,), the errors of stated poses are those of an arm: they
     arise at the gripper, and its rotation moves the camera on a lever. With `joints`, offsets of
-    its joints are estimated.
+    its joints are estimated. `kinds` are errors of an arm that its poses may share.
     """
 
     def __init__(
@@ -55,7 +60,9 @@ class StatedErrors:
         velocity: Array,
         gripper_from_camera: SE3 | None = None,
         joints: JointSlopes | None = None,
+        kinds: Mapping[str, SharedErrors] | None = None,
     ):
+        self.kinds = kinds or {}
         self.n = len(velocity)
         self.gripper_from_camera = gripper_from_camera or SE3.identity((self.n,))
         self.lever = self.gripper_from_camera.adjoint()
@@ -101,13 +108,18 @@ class StatedErrors:
         poses = 6 * self.n
         system = np.zeros((poses + self.size,) * 2)
         slope = np.zeros(poses + self.size)
-        precision = self._precision(variances)
-        pull = np.einsum("nij,nj->ni", precision, self.of_cameras(parameters))
-        drift = precision @ self.motion
+        noise = self.noise(variances)
+        back = self.lever.transpose(0, 2, 1)
+        own = back @ noise.information @ self.lever
+        half = (back @ noise.half.reshape(*noise.shared.shape)).reshape(poses, -1)
+        errors = self.lever @ self.of_cameras(parameters)[..., None]
+        pull = (back @ noise.weighted(errors))[..., 0]
+        drift = back @ noise.weighted(self.lever @ self.motion)
         moving = slice(poses, poses + self.motion.shape[2])
+        system[:poses, :poses] = -half @ half.T
         for i in range(self.n):
             rows = slice(6 * i, 6 * i + 6)
-            system[rows, rows] = precision[i]
+            system[rows, rows] += own[i]
             system[rows, moving] = -drift[i]
             system[moving, rows] = -drift[i].T
         system[moving, moving] = np.einsum("nij,nik->jk", self.motion, drift)
@@ -118,11 +130,13 @@ class StatedErrors:
         slope[shared] += parameters.shared / variances.shared
         return system, slope
 
-    def _precision(self, variances: Variances) -> Array:
-        """(n, 6, 6) information on each error of a camera."""
-        weighted = self.lever * variances.weight[:, None, None]
-        scaled = weighted / variances.sigma[:, None] ** 2
-        return self.lever.transpose(0, 2, 1) @ scaled
+    def noise(self, variances: Variances) -> SharedNoise:
+        """Covariance of the errors where they arise."""
+        own = variances.sigma**2 / variances.weight[:, None]
+        kinds = self.kinds
+        if not len(variances.of_kinds):
+            kinds = {}
+        return SharedNoise(own[:, :, None] * np.eye(6), variances.of_kinds, kinds)
 
 
 def velocity_of(poses: SE3) -> Array:

@@ -248,6 +248,19 @@ def systematic_covariance(
     return rows @ rows.T
 
 
+def by_shared(errors: StatedErrors, root: Array, variances: Variances) -> Array:
+    """The part of the covariance of the shared parameters by errors that stated poses share.
+
+    `root` is the factor of the parameters' covariance, root.T @ root.
+    """
+    covariance = root[:, 6 * errors.n :].T @ root
+    response = errors.of_rows(covariance).transpose(1, 2, 0)
+    noise = errors.noise(variances)
+    effects = noise.shared.reshape(6 * errors.n, -1)
+    rows = noise.weighted(response).reshape(len(effects), -1).T @ effects
+    return rows @ rows.T
+
+
 def _linear_motions(stated: SE3, gripper_from_camera: SE3) -> Array:
     """(n, r) orthonormal functions of the frame, linear in its rotation and position."""
     rotations = stated.rotation

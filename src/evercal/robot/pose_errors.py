@@ -18,6 +18,9 @@ from evercal.typing import Array, BoolArray, IntArray
 
 USUAL_ACCURACY_RAD = np.deg2rad(0.2)
 """Size of joint offsets of an arm of which nothing is known, one standard deviation."""
+WANTED = 1.0
+"""Evidence of shared errors that takes them in: the logarithm of the likelihood ratio to
+independent errors."""
 _USUAL_REACH_M = 0.5
 """Lever on which such a rotation moves a gripper."""
 _SMOOTH_M = 1.0

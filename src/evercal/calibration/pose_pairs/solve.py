@@ -41,13 +41,11 @@ from evercal.calibration.pose_pairs.starts import quick_fit
 from evercal.errors import InputError
 from evercal.geometry import SE3, cross_matrix, pose_distance
 from evercal.robot.mount import MountName, mount_named
-from evercal.robot.pose_errors import ArmErrors, shared_errors
+from evercal.robot.pose_errors import WANTED, ArmErrors, shared_errors
 from evercal.typing import BoolArray, IntArray
 
 _USUAL = ArmErrors()
 """An arm of which nothing is known."""
-_WANTED = 1.0
-"""Evidence of errors that poses share, logarithm of the likelihood ratio, that takes them in."""
 _REACH_M = 0.4
 """Distance from the gripper of what it carries above which the mount may be the other one."""
 _OTHER_MOUNT = 4.0
@@ -127,7 +125,7 @@ def solve_pose_pairs(
     # Errors that poses share look like a step, and a step like errors that poses share.
     if slip is not None and slip.evidence < evidence:
         slip = None
-    if slip is None and evidence > _WANTED:
+    if slip is None and evidence > WANTED:
         equation = sharing
         fit = robust_fit(equation, agreement(equation, fit.at))
     warnings: list[str] = []

@@ -1,0 +1,140 @@
+"""`shared_levels`: sizes of the errors that stated poses share, by the evidence of the images.
+
+The posterior of the errors under one prior, divided by this prior, is what the images say. With it
+the likelihood of any other prior follows in closed form, without another adjustment.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from evercal.robot.pose_errors import WANTED, SharedErrors
+from evercal.robot.shared_noise import (
+    SharedNoise,
+    mean_variances,
+    variance_uncertainty,
+)
+from evercal.typing import Array
+
+_MOST_JUDGES = 60
+"""Maximum number of frames that estimate the sizes."""
+_SMALLEST = -16.0
+"""Smallest logarithm of a variance, from that of its start."""
+_LARGEST = 9.0
+"""Largest one."""
+_FIRST_SHARED = 0.3
+"""First variance of a shared kind, in variances of independent errors."""
+_PRECISION = 1e-5
+"""Relative change of the likelihood that ends its maximization."""
+_LEAST_INFORMATION = 1e-9
+"""Lower bound of what the images say, as a share of the most in any direction."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What the images say about n errors of stated poses, and how these vary beforehand."""
+
+    information: Array
+    """(6 n, 6 n) of the images on the errors."""
+    pull: Array
+    """(6 n,) `information` times the errors that fit the images best."""
+    unit: tuple[Array, ...]
+    """(n, 6, 6) of independent errors for one metre^2, and for one radian^2."""
+    kinds: Mapping[str, SharedErrors]
+
+    def noise(self, variance: Array) -> SharedNoise:
+        """Covariance of the errors by variances (2 + k,)."""
+        own = variance[0] * self.unit[0] + variance[1] * self.unit[1]
+        return SharedNoise(own, variance[2:], self.kinds)
+
+    def likelihood(self, logarithms: Array) -> tuple[float, Array]:
+        """Twice the negative logarithm of the likelihood of variances, and its slope."""
+        variance = np.exp(logarithms)
+        noise = self.noise(variance)
+        inverse = noise.inverse()
+        posterior = np.linalg.inv(self.information + inverse)
+        mean = posterior @ self.pull
+        value = noise.logarithm() - np.linalg.slogdet(posterior)[1] - self.pull @ mean
+        rest = inverse - inverse @ (posterior + np.outer(mean, mean)) @ inverse
+        slope = []
+        blocks = rest.reshape(len(noise.independent), 6, -1, 6)
+        own = np.einsum("niNj,nN->nij", blocks, np.eye(len(blocks)))
+        for size, unit in zip(variance, self.unit, strict=False):
+            slope.append(size * (own * unit).sum())
+        for size, kind in zip(variance[2:], self.kinds.values(), strict=True):
+            effects = kind.slopes.reshape(len(rest), -1)
+            usual = size / kind.usual**2
+            value += usual
+            slope.append(size * (effects * (rest @ effects)).sum() + usual)
+        return float(value), np.array(slope)
+
+    def best(self, start: Array) -> tuple[Array, float]:
+        """Variances (2 + k,) of the largest likelihood, and twice its negative logarithm."""
+        logarithms = np.log(start)
+        bounds = [(value + _SMALLEST, value + _LARGEST) for value in logarithms]
+        found = minimize(
+            self.likelihood,
+            logarithms,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=bounds,
+            options={"ftol": _PRECISION},
+        )
+        return np.exp(found.x), float(found.fun)
+
+    def means(self, variance: Array) -> Array:
+        """Mean of each variance (2 + k,), see `mean_variances`."""
+        inverse = self.noise(variance).inverse()
+        posterior = np.linalg.inv(self.information + inverse)
+        pull = inverse - inverse @ posterior @ inverse
+        own = []
+        for unit in self.unit:
+            every = np.sqrt(np.einsum("nii->ni", unit).ravel())
+            own.append(np.diag(every)[:, every > 0])
+        return mean_variances(variance, variance_uncertainty(pull, own, self.kinds))
+
+
+def shared_levels(
+    errors: Array,
+    rows: Array,
+    weight: Array,
+    sigma: Array,
+    kinds: Mapping[str, SharedErrors],
+) -> Array | None:
+    """Variances (2 + k,) of independent positions and rotations and of each shared kind.
+
+    None where the images do not ask for shared errors.
+
+    Args:
+        errors: (n, 6) posterior mean of the errors, metres and radians.
+        rows: (r, n, 6) factor of their posterior covariance, rows^T rows.
+        weight: (n,) by which the variance of independent errors is divided.
+        sigma: (6,) standard deviations of the prior that posterior and mean belong to.
+        kinds: Kinds of errors that may be shared.
+    """
+    n = len(errors)
+    judges = np.linspace(0, n - 1, min(n, _MOST_JUDGES)).round().astype(int)
+    flat = rows[:, judges].reshape(len(rows), -1)
+    posterior = np.linalg.inv(flat.T @ flat)
+    variance = sigma**2 / weight[judges, None]
+    information = posterior - np.diag(1 / variance.ravel())
+    values, axes = np.linalg.eigh(information)
+    values = values.clip(_LEAST_INFORMATION * values[-1])
+    unit = np.zeros((2, len(judges), 6, 6))
+    for i in range(6):
+        unit[i // 3, :, i, i] = 1 / weight[judges]
+    seen = _Seen(
+        (axes * values) @ axes.T,
+        posterior @ errors[judges].ravel(),
+        tuple(unit),
+        {name: kind.of_rows(judges) for name, kind in kinds.items()},
+    )
+    start = sigma[[0, 3]] ** 2
+    _, alone = replace(seen, kinds={}).best(start)
+    first = [start[not name.endswith("translation")] for name in kinds]
+    found, least = seen.best(np.r_[start, _FIRST_SHARED * np.array(first)])
+    if (alone - least) / 2 < WANTED:
+        return None
+    return seen.means(found)
