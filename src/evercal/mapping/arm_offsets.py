@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from evercal.recordings.frame import Frame
+from evercal.geometry import SE3
+from evercal.recordings.frame import Frame, stated_grippers
 from evercal.robot.arm_offsets import ArmOffsets, JointSlopes
+from evercal.robot.mount import Mount
 
 
 def has_joints(frames: Sequence[Frame]) -> bool:
@@ -39,3 +41,14 @@ def with_offsets(frames: Sequence[Frame], offsets: ArmOffsets) -> list[Frame]:
             camera = change @ camera
         changed.append(replace(frame, base_from_gripper=after, base_from_camera=camera))
     return changed
+
+
+def camera_in_gripper(
+    frames: Sequence[Frame], stated: SE3, mount: Mount | None
+) -> SE3 | None:
+    """(n,) stated poses of the cameras in the gripper; None where camera poses were stated."""
+    if mount is None:
+        return None
+    if not mount.moves:
+        return stated
+    return stated_grippers(frames).inverse() @ stated

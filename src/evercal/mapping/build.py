@@ -14,9 +14,10 @@ import numpy as np
 from evercal.errors import InputError, require_numbers
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera
-from evercal.mapping.arm_offsets import joint_slopes, with_offsets
+from evercal.mapping.adjustment import Adjustment
+from evercal.mapping.arm_offsets import camera_in_gripper, joint_slopes, with_offsets
 from evercal.mapping.built_map import Adjusted, BuiltMap, HandEyeCorrection, of_rays
-from evercal.mapping.bundle_adjustment import Adjustment, BundleAdjustment
+from evercal.mapping.bundle_adjustment import BundleAdjustment
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.bundle_tracks import bundle_tracks
 from evercal.mapping.map_frame import (
@@ -240,7 +241,7 @@ def _adjust(
             stated_cameras,
             StatedErrors(
                 velocity,
-                _gripper_from_camera(prepared, options.mount),
+                camera_in_gripper(prepared.frames, prepared.stated, options.mount),
                 joints,
                 kinds,
             ),
@@ -269,15 +270,6 @@ def _offsets(start: ArmOffsets, adjustment: Adjustment) -> ArmOffsets:
         prior=adjustment.offsets_prior,
         determined=adjustment.offsets_known,
     )
-
-
-def _gripper_from_camera(prepared: PreparedFrames, mount: Mount | None) -> SE3 | None:
-    """(n,) stated poses of the cameras in the gripper; None where camera poses were stated."""
-    if mount is None:
-        return None
-    if not mount.moves:
-        return prepared.stated
-    return stated_grippers(prepared.frames).inverse() @ prepared.stated
 
 
 def _moved(

@@ -133,7 +133,7 @@ def shared_levels(
     )
     start = sigma[[0, 3]] ** 2
     _, alone = replace(seen, kinds={}).best(start)
-    first = [start[not name.endswith("translation")] for name in kinds]
+    first = [start[int(not name.endswith("translation"))] for name in kinds]
     found, least = seen.best(np.r_[start, _FIRST_SHARED * np.array(first)])
     if (alone - least) / 2 < WANTED:
         return None
