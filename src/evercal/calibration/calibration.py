@@ -49,12 +49,17 @@ class ErrorTerm:
     name: str
     translation_mm: float
     rotation_deg: float
+    cause: str = ""
+    """`arm`, `lens` or `images`; empty for others."""
+    covariance: Sequence[Sequence[float]] = ()
+    """(6, 6) metres and radians; empty in files of older versions."""
 
     @classmethod
-    def of(cls, name: str, covariance: Array) -> Self:
+    def of(cls, name: str, covariance: Array, cause: str = "") -> Self:
         """The term of a covariance (6, 6), metres and radians; rounding below zero counts as 0."""
         variance = np.maximum(np.diag(covariance), 0.0)
-        return cls(name, *axis_deviation(np.diag(variance)))
+        sizes = axis_deviation(np.diag(variance))
+        return cls(name, *sizes, cause, covariance.tolist())
 
 
 def position_shares(terms: Sequence[ErrorTerm]) -> list[float]:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
     from evercal.recordings import Recording
     from evercal.reports.inspected import LearnedLocalizer
+    from evercal.robot.pose_errors import ArmErrors
 
 MAP = "evercal"
 """The strategy of a map."""
@@ -170,6 +171,12 @@ class ArmGiven:
     arm_accuracy: Annotated[str | None, shown("0.2deg|1mm")] = None
     """Standard deviation of the joints' offsets, or of the gripper's position. Default: that of
     the arm's class, 0.06deg of industrial arms, 0.2deg of cobots, 1.1deg of hobby arms."""
+
+    def errors(self) -> "ArmErrors":
+        """What is known of the arm."""
+        from evercal.robot.pose_errors import ArmErrors
+
+        return ArmErrors.stated(self.arm, self.arm_accuracy)
 
 
 WhichArm = Annotated[ArmGiven, arg(name="")]

@@ -32,6 +32,7 @@ class EyeToHand(args.Verb):
     name: args.Name = None
     """Name of that scene. Default: the recording's own name."""
     reading: args.HowRead = field(default_factory=args.Reading)
+    which: args.WhichArm = field(default_factory=args.ArmGiven)
     at: args.At = None
 
     def run(self) -> int:
@@ -45,7 +46,9 @@ class EyeToHand(args.Verb):
             cell = Map.open(self.map or Path(folder) / "thing")
             start = f"{recording.name}: {len(recording.train)} images"
             with Bars(self.log, start) as bars:
-                calibration = cell.eye_to_hand(recording, on_progress=bars.step)
+                calibration = cell.eye_to_hand(
+                    recording, errors=self.which.errors(), on_progress=bars.step
+                )
         calibration.write(self.out)
         self.answer(
             {**calibration.to_dict(), **at_record(calibration, point)},

@@ -77,6 +77,7 @@ class Learn(args.Verb):
     strategy: args.Name = None
     """evercal builds a map; every other strategy trains a network. Default: that of the store."""
     reading: args.HowRead = field(default_factory=args.Reading)
+    which: args.WhichArm = field(default_factory=args.ArmGiven)
     networks: Annotated[NetworkOptions, arg(name="")] = field(
         default_factory=NetworkOptions
     )
@@ -190,12 +191,14 @@ class Learn(args.Verb):
             if strategy != args.MAP:
                 return learn_into_networks(self, strategy, recording, bars)
             from evercal.map import Map
+            from evercal.mapping.build import MapOptions
 
             cell = Map.open(self.store, encoder=self.encoder)
             report = cell.learn(
                 recording,
                 memory=self.memory,
                 gripper_from_camera=rough,
+                options=MapOptions(errors=self.which.errors()),
                 on_progress=bars.step,
             )
         if self.calibration is not None:

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -45,6 +45,7 @@ class Solve(args.Verb):
         Literal["robot", "camera", "both"] | None, args.shown("robot|camera|both")
     ] = None
     """Invert the poses of a file: robot, camera or both."""
+    which: args.WhichArm = field(default_factory=args.ArmGiven)
     out: args.OutFile = Path("calibration.json")
     """Calibration file to write."""
 
@@ -55,10 +56,11 @@ class Solve(args.Verb):
         source = {
             "command": "solve",
             **vars(self),
+            **vars(self.which),
             "robot_poses": str(self.robot_poses),
             "camera_poses": str(self.camera_poses),
         }
-        del source["out"], source["json"]
+        del source["out"], source["json"], source["which"]
         calibration = self._with_image_paths(replace(self._solved(), source=source))
         calibration.write(self.out)
         lines = (*calibration_lines(calibration), *_check_lines(calibration))
@@ -86,7 +88,8 @@ class Solve(args.Verb):
         if self.time_offset:
             return solve_with_offset(*read_streams(files), self.mount, scale_known)
         pairs, corners = read_pairs(files)
-        solved = solve(pairs, self.mount, scale_known, corners)
+        errors = self.which.errors()
+        solved = solve(pairs, self.mount, scale_known, corners, errors)
         say_notes(pairs.notes)  # a refusal is one line
         return solved
 

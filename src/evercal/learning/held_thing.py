@@ -45,6 +45,7 @@ from evercal.recordings.frame import (
 )
 from evercal.recordings.held_out import HeldOutSplit, require_frames
 from evercal.robot.mount import EYE_TO_HAND
+from evercal.robot.pose_errors import ArmErrors
 
 WHOLE_SIDE = 960
 """Short side of the images whose features are matched, pixels, where reduced ones do not suffice:
@@ -58,6 +59,7 @@ def learn_held_thing(
     recording: Recording,
     contents: MapContents,
     on_progress: OnProgress = lambda *_: None,
+    errors: ArmErrors | None = None,
 ) -> tuple[SceneMap, LearnReport]:
     """Map a thing in the frame of the gripper, and calibrate the fixed camera that observes it.
 
@@ -67,6 +69,7 @@ def learn_held_thing(
         recording: Images of the fixed camera with gripper poses; test frames are not read.
         contents: Encoder, and the scenes that the report counts.
         on_progress: Called with the current step, how much of it is done, and its total.
+        errors: What is known of the arm.
     """
     began = time.perf_counter()
     if not lacks_camera_poses(recording):
@@ -90,6 +93,7 @@ def learn_held_thing(
         confirmed=start.confirmed,
         swept_frames=SWEPT_FRAMES,
         whole=recording.train[0].camera,
+        errors=errors or ArmErrors(),
     )
     options = sized(options, budget, contents)
     options = replace(options, metric=recording.metric)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from evercal.errors import InputError
 from evercal.mapping.store import MapStore
 from evercal.recordings.frame import Recording
+from evercal.robot.pose_errors import ArmErrors
 from evercal.typing import PathLike
 
 if TYPE_CHECKING:
@@ -120,6 +121,7 @@ class LearnedScenes:
         recording: PathLike | Recording,
         *,
         name: str | None = None,
+        errors: ArmErrors | None = None,
         on_progress: OnProgress | None = None,
     ) -> Calibration:
         """Calibrate a fixed camera by any textured thing in the gripper; no marker is needed.
@@ -131,6 +133,7 @@ class LearnedScenes:
             recording: Images of the fixed camera and `base_from_gripper` at each, or their path.
                 The gripper turns the thing by 20 degrees and more about two axes.
             name: Of the scene. Default: the recording's name.
+            errors: What is known of the arm.
             on_progress: Called with the current step, how much of it is done, and its total.
                 Default: bars on stderr.
 
@@ -145,7 +148,7 @@ class LearnedScenes:
         from evercal.learning.held_thing import learn_held_thing
 
         def learned(named: Recording, step: OnProgress) -> tuple[SceneMap, LearnReport]:
-            return learn_held_thing(named, self._store.contents, step)
+            return learn_held_thing(named, self._store.contents, step, errors)
 
         report = self._add(recording, name, learned, on_progress)
         return learned_calibration(self.path, report.scene)

@@ -1,7 +1,6 @@
 """`known_arm`: the kinematics of an arm by its name, from its maker's numbers."""
 
 import json
-import re
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ from evercal.choices import ArmClass
 from evercal.errors import InputError
 from evercal.robot.arm import Arm, MovingJoint
 from evercal.robot.robot_model import RobotModel
-from evercal.typing import Array
 
 _FILE = Path(__file__).with_name("arms.json")
 """Metres and degrees by the name of an arm.
@@ -83,24 +81,3 @@ def arm_of(stated: str, base: str | None = None, gripper: str | None = None) -> 
         return known_arm(stated)
     model = RobotModel(stated)
     return model.arm(*model.chosen_links(base, gripper))
-
-
-def offset_rad(stated: str | None, arm: Arm, slopes: Array) -> float:
-    """Standard deviation of joint offsets by an accuracy such as 0.2deg of the joints.
-
-    Or 1mm of the gripper, which `slopes` (n, 6, k) of the joints move; if omitted, that of the
-    class of the arm.
-    """
-    if stated is None:
-        return USUAL_RAD[ARM_NAMES.get(arm.name, "cobot")]
-    number = re.fullmatch(r"(\d*\.?\d*[1-9]\d*) ?(deg|mm)", stated)
-    if number is None:
-        raise InputError(
-            f"`arm_accuracy` {stated!r}: give the standard deviation of the joints, such as 0.2deg,"
-            " or of the gripper, such as 1mm"
-        )
-    size = float(number[1])
-    if number[2] == "deg":
-        return size * np.pi / 180
-    squares = (slopes[:, :3] ** 2).sum()
-    return size / 1000 / np.sqrt(squares / len(slopes)).item()

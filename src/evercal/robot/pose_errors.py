@@ -7,17 +7,18 @@ covariance of rank r over all poses. Its size is estimated from the recording, s
 `evercal.calibration.pose_pairs.noise_levels`.
 """
 
+import re
 from typing import NamedTuple
 
 import numpy as np
 
+from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
 from evercal.robot.arm import Arm
 from evercal.robot.joint_slopes import joint_slopes
+from evercal.robot.known_arms import ARM_NAMES, USUAL_RAD, arm_of
 from evercal.typing import Array, BoolArray, IntArray
 
-USUAL_ACCURACY_RAD = np.deg2rad(0.2)
-"""Size of joint offsets of an arm of which nothing is known, one standard deviation."""
 WANTED = 1.0
 """Evidence of shared errors that takes them in: the logarithm of the likelihood ratio to
 independent errors."""
@@ -54,18 +55,47 @@ class ArmErrors(NamedTuple):
 
     arm: Arm | None = None
     """Its kinematics; without it, those of usual arms."""
-    accuracy_rad: float = USUAL_ACCURACY_RAD
-    """Prior standard deviation of an offset of a joint."""
+    accuracy_rad: float | None = None
+    """Prior standard deviation of an offset of a joint. Default: that of the arm's class."""
+    accuracy_m: float | None = None
+    """The same by the position of the gripper, which all joints move."""
+
+    @classmethod
+    def stated(cls, arm: str | None, accuracy: str | None) -> "ArmErrors":
+        """The arm of a name or URDF, and an accuracy: 0.2deg of joints, 1mm of the gripper."""
+        known = None if arm is None else arm_of(arm)
+        if accuracy is None:
+            return cls(known)
+        number = re.fullmatch(r"(\d*\.?\d*[1-9]\d*) ?(deg|mm)", accuracy)
+        if number is None:
+            raise InputError(
+                f"`arm_accuracy` {accuracy!r}: give the standard deviation of the joints, such as"
+                " 0.2deg, or of the gripper, such as 1mm"
+            )
+        size = float(number[1])
+        if number[2] == "deg":
+            return cls(known, accuracy_rad=np.deg2rad(size))
+        return cls(known, accuracy_m=size / 1000)
+
+    def offset_rad(self, slopes: Array) -> float:
+        """Prior standard deviation of an offset of a joint, by slopes (n, 6, k) of the joints."""
+        if self.accuracy_rad is not None:
+            return self.accuracy_rad
+        if self.accuracy_m is not None:
+            lever_m = np.sqrt((slopes[:, :3] ** 2).sum() / len(slopes))
+            return self.accuracy_m / float(lever_m)
+        name = self.arm.name if self.arm else ""
+        return USUAL_RAD[ARM_NAMES.get(name, "cobot")]
 
 
 def shared_errors(base_from_gripper: SE3, errors: ArmErrors) -> dict[str, SharedErrors]:
     """Kinds of errors of gripper poses (n,) in the order of time, by name."""
-    accuracy_rad = errors.accuracy_rad
     slopes = joint_slopes(
         base_from_gripper,
         errors.arm,
     )
     joints = _main_effects(slopes)
+    accuracy_rad = errors.offset_rad(slopes)
     n = len(base_from_gripper)
     metres, radians = pose_distance(base_from_gripper[:, None], base_from_gripper)
     shares = (metres / _SMOOTH_M) ** 2 + (radians / _SMOOTH_RAD) ** 2

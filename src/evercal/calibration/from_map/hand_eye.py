@@ -122,9 +122,13 @@ def hand_eye_of(
     estimate = start.parent_from_camera @ start_from_camera
     start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.parent_from_camera)
     terms = (
-        ErrorTerm.of("noise of images and gripper poses", correction.by_noise),
-        ErrorTerm.of("intrinsics", correction.by_lens),
-        ErrorTerm.of("slowly varying errors of gripper poses", correction.by_drift),
+        ErrorTerm.of(
+            "noise of images and gripper poses", correction.by_noise, "images"
+        ),
+        ErrorTerm.of("intrinsics", correction.by_lens, "lens"),
+        ErrorTerm.of(
+            "slowly varying errors of gripper poses", correction.by_drift, "arm"
+        ),
     )
     calibration = Calibration(
         start.mount.name,
@@ -148,6 +152,7 @@ def hand_eye_of(
     )
     if correction.arm is not None:
         calibration = _with_joints(calibration, correction.arm, frames)
+        calibration = _with_open_joint(calibration, correction.arm, frames)
     warnings = (*_warnings(built.adjusted), *warnings)
     advice = _advice(frames, estimate) if start.mount.moves else ""
     return HandEye(
@@ -218,6 +223,34 @@ def _with_joints(
         joints=_joint_offsets(arm),
         joint_covariance=arm.covariance,
         checks=LearnedChecks(joints_move_mm=_moved_mm(arm, frames)),
+    )
+
+
+def _with_open_joint(
+    calibration: Calibration, offsets: ArmOffsets, frames: Sequence[Frame]
+) -> Calibration:
+    """Add what an offset of the joint at the camera does, which no image shows.
+
+    It turns the gripper, or the base of a fixed camera, and the camera with it.
+    """
+    end = -1 if offsets.mount.moves else 0
+    joint = offsets.arm.chain[end].value
+    if offsets.arm.free()[joint]:
+        return calibration
+    values = np.array([f.joints_rad for f in frames[:1] if f.joints_rad is not None])
+    slope = offsets.arm.slopes(values)[0, :, joint]
+    if not offsets.mount.moves:
+        slope = offsets.arm.poses(values).adjoint()[0] @ slope
+    camera_from_parent = calibration.parent_from_child.inverse()
+    motion = offsets.prior[joint] * (camera_from_parent.adjoint() @ slope)
+    # The covariance is of the translation in the parent frame and the rotation about child axes.
+    motion[:3] = calibration.parent_from_child.rotation_matrix() @ motion[:3]
+    added = np.outer(motion, motion)
+    term = ErrorTerm.of(f"offset of joint {offsets.arm.joints[joint]}", added, "arm")
+    return replace(
+        calibration,
+        covariance=calibration.covariance + added,
+        error_terms=(*calibration.error_terms, term),
     )
 
 

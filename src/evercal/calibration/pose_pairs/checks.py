@@ -50,6 +50,10 @@ _ELONGATED = 4.0
 """Ratio of the two largest standard deviations that names a direction."""
 _SMALL_MM = 0.1
 """Standard deviation below which nothing is left open."""
+_SMOOTH = (
+    "smooth errors of the arm or the board, which similar poses share: add poses that differ by 20"
+    " cm and 60 deg, lay the board on a flat plate, name the arm with `arm`"
+)
 _REMEDIES = {
     "intrinsics": (
         "the intrinsics, which trade against distance: tilt the board by 30 to 45 deg, vary the"
@@ -59,6 +63,11 @@ _REMEDIES = {
         "a depth error that all images share: add poses that turn by 30 to 60 deg about two axes,"
         " so that the same depth points in different directions"
     ),
+    "joint offsets": (
+        "offsets of the arm's joints: name the arm with `arm`, or record joint values with a URDF"
+    ),
+    "smooth translation": _SMOOTH,
+    "smooth rotation": _SMOOTH,
     "size": (
         "the size of the squares, which trades against distance: measure it over the whole board,"
         " and move the gripper by 20 cm or more between poses"
@@ -291,7 +300,10 @@ def left_open(fit: HandEyeFit, parent: str) -> list[str]:
     for group, remedy in _REMEDIES.items():
         share = fit.contributions.get(group, np.zeros((6, 6)))
         if np.trace(share[:3, :3]) > _MAIN_SHARE * total:
-            sentences.append(f"Most of the uncertainty is due to {remedy}.")
+            left = 1000 * np.sqrt(np.trace(position - share[:3, :3]) / 3)
+            sentences.append(
+                f"Most of the uncertainty is due to {remedy}. Without it, {left:.2f} mm are left."
+            )
     values, axes = np.linalg.eigh(position)
     sigma = 1000 * np.sqrt(np.maximum(values, 0))
     if sigma[2] > _ELONGATED * max(sigma[1], 1e-9):

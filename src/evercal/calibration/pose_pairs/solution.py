@@ -46,6 +46,22 @@ _CAUSES = {
 """Names of the error terms, by kind of noise and group of extras."""
 
 
+_ORIGINS = {
+    "joint": "arm",
+    "smooth": "arm",
+    "drift": "arm",
+    "intrinsics": "lens",
+}
+"""Where an error comes from, by the first word of its kind; others come from the images."""
+
+
+def _origin(kind: str) -> str:
+    first, *_ = kind.split()
+    if kind == "rotation about gripper":
+        return "arm"
+    return _ORIGINS.get(first, "images")
+
+
 @dataclass(frozen=True, eq=False)
 class PairSolution:
     """A fit and its pose pairs."""
@@ -210,6 +226,6 @@ class PairSolution:
         for name, cause in _CAUSES.items():
             part = fit.contributions.get(name, np.zeros((6, 6)))
             if np.trace(part) > least:
-                terms.append(ErrorTerm.of(cause, part))
+                terms.append(ErrorTerm.of(cause, part, _origin(name)))
         rest = fit.covariance[:6, :6] - sum(fit.contributions.values())
         return (*terms, ErrorTerm.of("few poses", rest))
