@@ -14,8 +14,8 @@ from evercal.robot.known_arms import (
     USUAL_RAD,
     arm_of,
     known_arm,
-    offset_rad,
 )
+from evercal.robot.pose_errors import ArmErrors
 
 
 def test_a_ur5e_stands_as_its_maker_draws_it() -> None:
@@ -82,12 +82,14 @@ def test_an_accuracy_is_that_of_the_joints_or_of_the_gripper() -> None:
     arm = known_arm("so101")
     slopes = np.zeros((4, 6, 2))
     slopes[:, 0] = np.array([0.3, 0.4])
-    assert offset_rad(None, arm, slopes) == USUAL_RAD["hobby"]
-    assert offset_rad("0.2deg", arm, slopes) == pytest.approx(np.radians(0.2))
-    assert offset_rad("1.5 mm", arm, slopes) == pytest.approx(0.003)
+    assert ArmErrors(arm).offset_rad(slopes) == USUAL_RAD["hobby"]
+    joints = ArmErrors.stated("so101", "0.2deg")
+    assert joints.offset_rad(slopes) == pytest.approx(np.radians(0.2))
+    position = ArmErrors.stated(None, "1.5 mm")
+    assert position.offset_rad(slopes) == pytest.approx(0.003)
 
 
 @pytest.mark.parametrize("text", ["0.2", "0deg", "-1mm", "1mm2", "nan deg", "0.2 rad"])
 def test_another_accuracy_is_refused(text: str) -> None:
     with pytest.raises(InputError, match=r"`arm_accuracy` .* such as 0.2deg"):
-        offset_rad(text, known_arm("ur5e"), np.ones((1, 6, 1)))
+        ArmErrors.stated("ur5e", text)

@@ -35,6 +35,7 @@ from evercal.mapping.bundle_options import FIXED, BundleOptions
 from evercal.mapping.shared_levels import shared_levels
 from evercal.mapping.stated_errors import StatedErrors, Variances
 from evercal.mapping.variance_components import (
+    HIDDEN,
     by_shared,
     noise_of,
     pose_sigma,
@@ -322,6 +323,7 @@ class BundleAdjustment:
         if len(variances.of_kinds):
             systematic = by_shared(self.errors, root, variances)
             whole = whole - systematic[np.ix_(with_lens, with_lens)]
+            systematic = HIDDEN * systematic
         else:
             systematic = systematic_covariance(
                 self.frames.stated,

@@ -256,7 +256,7 @@ def by_shared(errors: StatedErrors, root: Array, variances: Variances) -> Array:
     covariance = root[:, 6 * errors.n :].T @ root
     response = errors.of_rows(covariance).transpose(1, 2, 0)
     noise = errors.noise(variances)
-    effects = noise.shared.reshape(6 * errors.n, -1)
+    effects = noise.shared.reshape(6 * errors.n, noise.shared.shape[2])
     rows = noise.weighted(response).reshape(len(effects), -1).T @ effects
     return rows @ rows.T
 
