@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from evercal.geometry import SE3, Camera, pose_distance
-from evercal.mapping.adjustment import Adjustment
 from evercal.mapping.bundle_adjustment import BundleAdjustment
-from evercal.mapping.bundle_equations import BundleTracks
+from evercal.mapping.bundle_equations import Adjustment, BundleTracks
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.stated_errors import StatedErrors
 from evercal.simulation.box_room import look_at

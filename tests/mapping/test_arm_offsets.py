@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3
-from evercal.mapping.adjustment import Adjustment
 from evercal.mapping.arm_offsets import joint_slopes, with_offsets
 from evercal.mapping.build import MapOptions
 from evercal.mapping.bundle_adjustment import BundleAdjustment
+from evercal.mapping.bundle_equations import Adjustment
 from evercal.mapping.stated_errors import StatedErrors
 from evercal.recordings.frame import Frame
 from evercal.robot.arm import Arm, MovingJoint

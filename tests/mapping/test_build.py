@@ -13,10 +13,10 @@ from evercal.errors import InputError
 from evercal.features.encoder import Encoder, load_encoder
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
 from evercal.mapping import build
-from evercal.mapping.adjustment import Adjustment
 from evercal.mapping.build import MapOptions, _moved, build_map, spread_frames
 from evercal.mapping.built_map import BuiltMap, HandEyeCorrection
 from evercal.mapping.bundle_adjustment import BundleAdjustment
+from evercal.mapping.bundle_equations import Adjustment
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3
-from evercal.mapping.adjustment import Adjustment
 from evercal.mapping.build import MapOptions
 from evercal.mapping.bundle_adjustment import BundleAdjustment
+from evercal.mapping.bundle_equations import Adjustment
 from evercal.mapping.stated_errors import StatedErrors
 from evercal.robot.known_arms import known_arm
 from evercal.robot.mount import EYE_IN_HAND

@@ -51,7 +51,7 @@ class ErrorTerm:
     rotation_deg: float
     cause: str = ""
     """`arm`, `lens` or `images`; empty for others."""
-    covariance: Sequence[Sequence[float]] = ()
+    covariance: list[list[float]] = field(default_factory=list)
     """(6, 6) metres and radians; empty in files of older versions."""
 
     @classmethod

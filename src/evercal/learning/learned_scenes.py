@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 from evercal.errors import InputError
 from evercal.mapping.store import MapStore
 from evercal.recordings.frame import Recording
-from evercal.robot.pose_errors import ArmErrors
 from evercal.typing import PathLike
 
 if TYPE_CHECKING:
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from evercal.mapping.refresh import RefreshOptions
     from evercal.mapping.scene_map import SceneMap
     from evercal.progress import OnProgress
+    from evercal.robot.pose_errors import ArmErrors
 
     Learn = Callable[[Recording, OnProgress], tuple[SceneMap, LearnReport]]
 

@@ -14,10 +14,10 @@ import numpy as np
 from evercal.errors import InputError, require_numbers
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3, Camera
-from evercal.mapping.adjustment import Adjustment
 from evercal.mapping.arm_offsets import camera_in_gripper, joint_slopes, with_offsets
 from evercal.mapping.built_map import Adjusted, BuiltMap, HandEyeCorrection, of_rays
 from evercal.mapping.bundle_adjustment import BundleAdjustment
+from evercal.mapping.bundle_equations import Adjustment
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.bundle_tracks import bundle_tracks
 from evercal.mapping.map_frame import (

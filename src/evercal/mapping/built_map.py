@@ -7,9 +7,8 @@ from typing import Self
 import numpy as np
 
 from evercal.geometry import SE3, Camera
-from evercal.mapping.adjustment import Adjustment
 from evercal.mapping.arm_offsets import with_offsets
-from evercal.mapping.bundle_equations import DISTORTION, INTRINSICS
+from evercal.mapping.bundle_equations import DISTORTION, INTRINSICS, Adjustment
 from evercal.mapping.scene_map import LeftOut, SceneMap
 from evercal.recordings.frame import Frame
 from evercal.robot.arm_offsets import ArmOffsets

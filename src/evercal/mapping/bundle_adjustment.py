@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.mapping.adjustment import Adjustment
 from evercal.mapping.bundle_equations import (
     COMMON,
     INTRINSICS,
+    Adjustment,
     BundleTracks,
     Linearised,
     NormalEquations,
@@ -32,7 +32,6 @@ from evercal.mapping.bundle_equations import (
     StatedFrames,
 )
 from evercal.mapping.bundle_options import FIXED, BundleOptions
-from evercal.mapping.shared_levels import shared_levels
 from evercal.mapping.stated_errors import StatedErrors, Variances
 from evercal.mapping.variance_components import (
     HIDDEN,
@@ -139,6 +138,8 @@ class BundleAdjustment:
         self, tracks: BundleTracks, estimate: Estimate, variances: Variances
     ) -> tuple[Estimate, Variances]:
         """Adjust again with errors that stated poses share, where the images ask for them."""
+        from evercal.mapping.shared_levels import shared_levels
+
         levels = shared_levels(
             self.errors.at_origin(estimate.parameters),
             self.errors.of_rows(estimate.root),

@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize
 
-from evercal.robot.pose_errors import WANTED, SharedErrors
-from evercal.robot.shared_noise import (
+from evercal.robot.pose_errors import (
+    WANTED,
+    SharedErrors,
     SharedNoise,
     mean_variances,
     variance_uncertainty,

@@ -17,8 +17,7 @@ from evercal.mapping.bundle_equations import (
     Parameters,
 )
 from evercal.robot.arm_offsets import JointSlopes
-from evercal.robot.pose_errors import SharedErrors
-from evercal.robot.shared_noise import SharedNoise
+from evercal.robot.pose_errors import SharedErrors, SharedNoise
 from evercal.typing import Array
 
 LONG_STEP = 4

@@ -1,14 +1,18 @@
 """`ArmOffsets`: estimated offsets of an arm's joints, and how they move the gripper."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 
 from evercal.geometry import SE3
-from evercal.robot.arm import Arm
 from evercal.robot.mount import Mount
 from evercal.typing import Array, BoolArray
+
+if TYPE_CHECKING:
+    from evercal.robot.arm import Arm
 
 
 class JointSlopes(NamedTuple):

@@ -21,7 +21,12 @@ from evercal.calibration.from_map.hand_eye_start import HandEyeStart
 from evercal.calibration.from_map.next_views import open_position
 from evercal.calibration.verdict import verdict
 from evercal.geometry import SE3, UncertainPose, length_mm_deg, pose_distance_mm_deg
-from evercal.mapping.built_map import MOST_FOCAL_PERCENT, Adjusted, BuiltMap
+from evercal.mapping.built_map import (
+    MOST_FOCAL_PERCENT,
+    Adjusted,
+    BuiltMap,
+    HandEyeCorrection,
+)
 from evercal.recordings.frame import Frame, stated_grippers
 from evercal.robot.arm_offsets import ArmOffsets
 
@@ -121,15 +126,6 @@ def hand_eye_of(
     )
     estimate = start.parent_from_camera @ start_from_camera
     start_mm, start_deg = pose_distance_mm_deg(estimate.pose, start.parent_from_camera)
-    terms = (
-        ErrorTerm.of(
-            "noise of images and gripper poses", correction.by_noise, "images"
-        ),
-        ErrorTerm.of("intrinsics", correction.by_lens, "lens"),
-        ErrorTerm.of(
-            "slowly varying errors of gripper poses", correction.by_drift, "arm"
-        ),
-    )
     calibration = Calibration(
         start.mount.name,
         estimate.pose,
@@ -141,7 +137,7 @@ def hand_eye_of(
             "estimated": built.scene.adjusted_camera,
         },
         images=_uses(frames, built),
-        error_terms=terms,
+        error_terms=_error_terms(correction),
         source={
             "command": "learn" if start.mount.moves else "eye-to-hand",
             "scene": built.scene.name,
@@ -164,6 +160,16 @@ def hand_eye_of(
         *_from_given(calibration, given),
         warnings,
         advice,
+    )
+
+
+def _error_terms(correction: HandEyeCorrection) -> tuple[ErrorTerm, ...]:
+    noise = "noise of images and gripper poses"
+    shared = "errors that gripper poses share"
+    return (
+        ErrorTerm.of(noise, correction.by_noise, "images"),
+        ErrorTerm.of("intrinsics", correction.by_lens, "lens"),
+        ErrorTerm.of(shared, correction.by_drift, "arm"),
     )
 
 

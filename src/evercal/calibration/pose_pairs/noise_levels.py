@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2, f
 
 from evercal.calibration.pose_pairs.pose_equation import System
-from evercal.robot.shared_noise import (
+from evercal.robot.pose_errors import (
     SharedNoise,
     mean_variances,
     variance_uncertainty,
