@@ -60,11 +60,20 @@ class _Seen:
         value = noise.logarithm() - np.linalg.slogdet(posterior)[1] - self.pull @ mean
         rest = inverse - inverse @ (posterior + np.outer(mean, mean)) @ inverse
         slope = []
-        blocks = rest.reshape(len(noise.independent), 6, -1, 6)
+        blocks = rest.reshape(
+            len(noise.independent),
+            6,
+            -1,
+            6,
+        )
         own = np.einsum("niNj,nN->nij", blocks, np.eye(len(blocks)))
         for size, unit in zip(variance, self.unit, strict=False):
             slope.append(size * (own * unit).sum())
-        for size, kind in zip(variance[2:], self.kinds.values(), strict=True):
+        for size, kind in zip(
+            variance[2:],
+            self.kinds.values(),
+            strict=True,
+        ):
             effects = kind.slopes.reshape(len(rest), -1)
             usual = size / kind.usual**2
             value += usual
@@ -94,7 +103,14 @@ class _Seen:
         for unit in self.unit:
             every = np.sqrt(np.einsum("nii->ni", unit).ravel())
             own.append(np.diag(every)[:, every > 0])
-        return mean_variances(variance, variance_uncertainty(pull, own, self.kinds))
+        return mean_variances(
+            variance,
+            variance_uncertainty(
+                pull,
+                own,
+                self.kinds,
+            ),
+        )
 
 
 def shared_levels(
@@ -116,7 +132,15 @@ def shared_levels(
         kinds: Kinds of errors that may be shared.
     """
     n = len(errors)
-    judges = np.linspace(0, n - 1, min(n, _MOST_JUDGES)).round().astype(int)
+    judges = (
+        np.linspace(
+            0,
+            n - 1,
+            min(n, _MOST_JUDGES),
+        )
+        .round()
+        .astype(int)
+    )
     flat = rows[:, judges].reshape(len(rows), -1)
     posterior = np.linalg.inv(flat.T @ flat)
     variance = sigma**2 / weight[judges, None]

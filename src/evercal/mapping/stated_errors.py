@@ -40,7 +40,12 @@ class Variances:
     def close_to(self, other: "Variances", tolerance: float) -> bool:
         """Whether two priors differ by less than this share."""
         return all(
-            np.allclose(values, vars(other)[name], rtol=tolerance, atol=0)
+            np.allclose(
+                values,
+                vars(other)[name],
+                rtol=tolerance,
+                atol=0,
+            )
             for name, values in vars(self).items()
         )
 
@@ -135,7 +140,11 @@ class StatedErrors:
         kinds = self.kinds
         if not len(variances.of_kinds):
             kinds = {}
-        return SharedNoise(own[:, :, None] * np.eye(6), variances.of_kinds, kinds)
+        return SharedNoise(
+            own[:, :, None] * np.eye(6),
+            variances.of_kinds,
+            kinds,
+        )
 
 
 def velocity_of(poses: SE3) -> Array:
@@ -147,5 +156,9 @@ def velocity_of(poses: SE3) -> Array:
     size = np.linalg.norm(steps, axis=1)
     smooth = size < LONG_STEP * np.median(size) + 1e-9
     mean = (steps[:-1] + steps[1:]) / 2
-    velocity[1:-1] = np.where((smooth[:-1] & smooth[1:])[:, None], mean, 0)
+    velocity[1:-1] = np.where(
+        (smooth[:-1] & smooth[1:])[:, None],
+        mean,
+        0,
+    )
     return velocity

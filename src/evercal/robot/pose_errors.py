@@ -160,7 +160,11 @@ def shared_errors(base_from_gripper: SE3, errors: ArmErrors) -> dict[str, Shared
             moved_m,
         )
         kinds[f"{name} rotation"] = SharedErrors(
-            turn.reshape(n, 6, -1),
+            turn.reshape(
+                n,
+                6,
+                -1,
+            ),
             accuracy_rad,
         )
     return kinds
@@ -173,7 +177,11 @@ def _main_effects(slopes: Array) -> Array:
     least = np.sqrt(_LEAST_SHARE) * size[0]
     large = size > least
     main = effects[:, large] * size[large]
-    return main.reshape(len(slopes), 6, -1)
+    return main.reshape(
+        len(slopes),
+        6,
+        -1,
+    )
 
 
 def _effects(correlation: Array) -> Array:
@@ -212,7 +220,11 @@ class SharedNoise:
         """(n, 6, 6) of errors that no other pose shares."""
         n = len(independent)
         parts = [np.zeros((n, 6, 0))]
-        for size, kind in zip(np.sqrt(variance), shared.values(), strict=True):
+        for size, kind in zip(
+            np.sqrt(variance),
+            shared.values(),
+            strict=True,
+        ):
             parts.append(size * kind.slopes)
         self.shared = np.concatenate(parts, 2)
         """(n, 6, r) errors by the effects of all kinds that poses share; their covariance is the
@@ -224,7 +236,12 @@ class SharedNoise:
         inner = flat.T @ weighted
         inner.flat[:: rank + 1] += 1.0
         self._root = np.linalg.cholesky(inner)
-        half = solve_triangular(self._root, weighted.T, lower=True, check_finite=False)
+        half = solve_triangular(
+            self._root,
+            weighted.T,
+            lower=True,
+            check_finite=False,
+        )
         self.half = half.T
         """(6 n, r): the inverse covariance is that of independent errors less half @ half.T."""
 
@@ -238,7 +255,11 @@ class SharedNoise:
     def blocks(self) -> Array:
         """(n, 6, 6) blocks of the inverse covariance."""
         half = self.half.reshape(*self.shared.shape)
-        return self.information - half @ half.transpose(0, 2, 1)
+        return self.information - half @ half.transpose(
+            0,
+            2,
+            1,
+        )
 
     def inverse(self) -> Array:
         """(6 n, 6 n) inverse covariance."""

@@ -115,8 +115,18 @@ def ellipsoid_factor(
     d = len(covariance)
     values, axes = np.linalg.eigh(covariance)
     whiten = axes / np.sqrt(np.maximum(values, 1e-300))
-    gradient = np.einsum("dm,kde,em->mk", whiten, slopes, whiten)
-    relative = np.einsum("mk,kl,ml->m", gradient, uncertainty, gradient).max()
+    gradient = np.einsum(
+        "dm,kde,em->mk",
+        whiten,
+        slopes,
+        whiten,
+    )
+    relative = np.einsum(
+        "mk,kl,ml->m",
+        gradient,
+        uncertainty,
+        gradient,
+    ).max()
     freedom = float(np.clip(2 / max(relative, 1e-300), 2.5, 1e6))
     quantile = d * f.ppf(_COVERAGE, d, freedom)
     return max(1.0, float(quantile / chi2.ppf(_COVERAGE, d)))
@@ -160,7 +170,12 @@ def _likelihood(logarithms: Array, system: System, first: Array) -> tuple[float,
     own = noise.blocks() - half @ half.transpose(0, 2, 1)
     slope = []
     count = len(system.directions)
-    kinds = zip(variance, first, system.directions.values(), strict=False)
+    kinds = zip(
+        variance,
+        first,
+        system.directions.values(),
+        strict=False,
+    )
     for size, level, spread in kinds:
         expected = (spread * (own @ spread)).sum()
         observed = ((spread.transpose(0, 2, 1) @ pull[..., None]) ** 2).sum()
