@@ -38,6 +38,10 @@ VERBS = {
     "same-model": ("same_model", "images of other cameras of the recording's model"),
     "warps": ("warps", "images that no camera in the room makes"),
     "handeye": ("hand_eye", "pose pairs: errors, ellipsoids, outliers, scale, time"),
+    "shared-errors": (
+        "shared_errors",
+        "arms whose stated poses err together: errors, sigma, few poses",
+    ),
     "boards": ("boards", "detection of rendered boards, beside the finders of OpenCV"),
     "handeye-boards": ("hand_eye_boards", "boards and intrinsics from the same images"),
     "board-errors": (
