@@ -14,10 +14,16 @@ from benchmarks.rows import Row
 from evercal.calibration.pose_pairs.pair_files import PairFiles, read_pairs
 from evercal.calibration.pose_pairs.solve import solve
 from evercal.errors import InputError
+from evercal.robot.mount import MountName
 
-CHARUCO = "charuco --size 5x7 --square-mm 36.195 --marker-mm 18.256 --dictionary 6X6_250"
-RECORDINGS = {
-    "handeye/kuka_eye_in_hand": ("eye_in_hand", "chessboard --size 24x17 --square-mm 15"),
+CHARUCO = (
+    "charuco --size 5x7 --square-mm 36.195 --marker-mm 18.256 --dictionary 6X6_250"
+)
+RECORDINGS: dict[str, tuple[MountName, str]] = {
+    "handeye/kuka_eye_in_hand": (
+        "eye_in_hand",
+        "chessboard --size 24x17 --square-mm 15",
+    ),
     "handeye/franka_eye_in_hand": (
         "eye_in_hand",
         "chessboard --size 9x6 --square-mm 23.6",
@@ -88,6 +94,32 @@ def _apart(pairs: Any, corners: Any, mount: Any, half: np.ndarray) -> Row:
         "sigma deg": one.sigma_deg,
         "d2": float(off @ np.linalg.solve(both, off)),
     }
+
+
+def evidence(real: Path, out: Path) -> Iterator[Row]:
+    """Evidence of each kind of errors that the poses share, alone and together."""
+    from evercal.calibration.pose_pairs.noise_levels import evidence_of_shared
+    from evercal.calibration.pose_pairs.solve import solve_pose_pairs
+    from evercal.robot.pose_errors import ArmErrors, shared_errors
+
+    for name, (mount, _) in RECORDINGS.items():
+        robot = real / name / "base_from_gripper.csv"
+        pairs, corners = read_pairs(PairFiles(robot, out / f"{Path(name).name}.json"))
+        solved = solve_pose_pairs(pairs, mount, corners=corners)
+        kinds = shared_errors(pairs.base_from_gripper, ArmErrors())
+        row: Row = {
+            "recording": Path(name).name,
+            "poses": int(solved.fit.inliers.sum()),
+        }
+        for some in ("joint offsets", "smooth", "drift", ""):
+            shared = {
+                kind: errors.of_rows(solved.rows)
+                for kind, errors in kinds.items()
+                if kind.startswith(some)
+            }
+            equation = replace(solved.equation, shared=shared)[solved.fit.inliers]
+            row[some or "all"] = evidence_of_shared(equation.system(solved.fit.at))
+        yield row
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 from unittest.mock import patch
@@ -18,8 +19,9 @@ from tyro.conf import arg
 
 from benchmarks.hand_eye import Setting, pose, recording
 from benchmarks.pair_answers import Recording, answers
+from benchmarks.real_halves import boards, evidence, halves
 from benchmarks.rows import Row, median_of, numbers, once, save
-from benchmarks.same_answers import source_of
+from benchmarks.same_answers import ROOT, source_of
 from evercal.evaluation.metrics import share_inside
 from evercal.geometry import SE3
 from evercal.robot.arm import Arm, MovingJoint
@@ -275,7 +277,8 @@ def _rows(
             values = (*vars(condition).values(), name)
             label = " | ".join(map(str, values))
             file = out / f"{label.replace(' | ', '-')}-{count}.json"
-            rows = once(file, lambda n=name: measured(n, condition, count, before))
+            answered = partial(measured, name, condition, count, before)
+            rows = once(file, answered)
             everyone = " | ".join(map(str, ("all", *values[1:])))
             pooled.setdefault(everyone, []).extend(rows)
             pooled[label] = rows
@@ -287,6 +290,7 @@ def run(
     count: Annotated[int, arg(name="trials")] = 4,
     reference: str = "46c21235",
     out: Path = Path("runs/shared-errors"),
+    real: Path | None = None,
 ) -> None:
     """Solve simulated pose pairs of arms whose poses err together.
 
@@ -295,8 +299,19 @@ def run(
         count: Recordings of each arm and condition; 25 times as many without an arm.
         reference: Commit whose answers stand as `before`.
         out: Folder of the answers, which are kept, and of the rows.
+        real: Folder of real recordings, `handeye` and `abb_fixed`: only their halves are compared.
     """
     before = source_of(reference, out)
+    if real is not None:
+        boards(real, out)
+        command = [sys.executable, "-m", "benchmarks.real_halves", str(real), str(out)]
+        environment = {**os.environ, "PYTHONPATH": str(before / "src")}
+        old = json.loads(subprocess.check_output(command, env=environment, cwd=ROOT))
+        rows = [{"by": reference, **row} for row in old]
+        rows += [{"by": "this tree", **row} for row in halves(real, out)]
+        save(out / "halves.csv", rows)
+        save(out / "evidence.csv", list(evidence(real, out)))
+        return
     for name, cells in parts().items():
         if part not in ("all", name):
             continue
