@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 from tyro.conf import arg
 
-from benchmarks.hand_eye import Setting, pose, recording
+from benchmarks.hand_eye import Setting, pose, recording, rotations
 from benchmarks.pair_answers import Recording, answers
 from benchmarks.real_halves import boards, evidence, halves
 from benchmarks.rows import Row, median_of, numbers, once, save
@@ -115,6 +115,9 @@ def drawn(condition: Condition, seed: int) -> Recording:
         scatter = unit * rng.normal(0, 0.01, values.shape)
         stated = arm.poses(values - off + scatter)
     elsewhere = pose(Rotation.random(rng=rng), ahead)
+    if condition.mount == "eye_to_hand":  # the camera looks back at the gripper
+        back = rotations(at_rest) * Rotation.from_euler("x", np.pi)
+        elsewhere = pose(back, ahead)
     if condition.mount == "eye_in_hand":
         camera = in_gripper.inverse() @ true.inverse() @ elsewhere
         truth = in_gripper
