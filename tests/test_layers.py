@@ -43,9 +43,9 @@ ORDER = (
 FOR_ALL = (
     "bounds",
     "choices",
+    "classes",
     "cluster",
     "errors",
-    "notebook",
     "processes",
     "progress",
     "typing",

@@ -9,10 +9,11 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import cache
 from typing import TypeVar
 
+from evercal.classes import frozen
 from evercal.errors import InputError
 
 Kind = TypeVar("Kind", bound="Bounds")
@@ -24,7 +25,7 @@ class TooLargeError(InputError):
     """More than a bound allows; status 413 of the service."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Bounds:
     """Sizes above which a file is refused."""
 
@@ -68,7 +69,7 @@ class Bounds:
     """Header of a safetensors file."""
 
 
-@dataclass(frozen=True)
+@frozen
 class RequestBounds(Bounds):
     """Sizes above which a request is refused, and how many requests may wait."""
 

@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+from evercal.classes import html_table
 from evercal.errors import InputError
 from evercal.learning.learned_scenes import LearnedScenes
 from evercal.mapping.store import MapStore
-from evercal.notebook import html_table
 from evercal.recordings.frame import Recording
 from evercal.robot.mount import MountName
 from evercal.typing import PathLike

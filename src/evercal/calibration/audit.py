@@ -1,7 +1,6 @@
 """Detect recorded episodes whose images disagree with the stated camera pose."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -9,6 +8,7 @@ import numpy as np
 
 from evercal.calibration.located import ImagePose, fuse, locate
 from evercal.calibration.transform_file import read_transform
+from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg
 from evercal.recordings.images import Picture, files_in
@@ -23,7 +23,7 @@ POSE_FILES = ("calibration.json", "base_from_camera.txt")
 """Files of an episode's folder that state the pose of its camera."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Episode:
     """Result for one episode."""
 

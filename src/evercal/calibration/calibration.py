@@ -27,9 +27,9 @@ from evercal.calibration.framed_pose import FramedPose
 from evercal.calibration.framed_pose import ImageUse as ImageUse
 from evercal.calibration.framed_pose import JointOffset as JointOffset
 from evercal.choices import ExportFormat
+from evercal.classes import frozen, frozen_arrays, html_table
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation, pose_distance
-from evercal.notebook import html_table
 from evercal.robot.mount import MountName, mount_named
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
@@ -42,7 +42,7 @@ FORMAT = "evercal-calibration"
 VERSION = 1
 
 
-@dataclass(frozen=True)
+@frozen
 class ErrorTerm:
     """One source of error in the covariance: root mean square of the deviations of three axes."""
 
@@ -276,7 +276,7 @@ class RigPair(NamedTuple):
         }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Rig:
     """Cameras that stand still in one base frame."""
 

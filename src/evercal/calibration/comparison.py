@@ -6,13 +6,14 @@ pose explains.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from evercal.calibration.framed_pose import FramedPose
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import axis_deviation, length_mm_deg
 from evercal.geometry.rays import angles, fit_rays
@@ -43,7 +44,7 @@ _CAUSES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Comparison:
     """Distance of two calibrations."""
 

@@ -6,13 +6,14 @@ from typing import Any, Self
 
 import numpy as np
 
+from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.robot.mount import MountName, mount_named
 from evercal.typing import Array
 
 
-@dataclass(frozen=True)
+@frozen
 class ImageUse:
     """Use of one image or pose pair."""
 
@@ -25,7 +26,7 @@ class ImageUse:
     residual_deg: float | None = None
 
 
-@dataclass(frozen=True)
+@frozen
 class JointOffset:
     """Offset of a joint of the arm, which is to be added to the values that the robot reports."""
 

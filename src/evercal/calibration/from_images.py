@@ -7,7 +7,7 @@ with the grip if that has changed, see `held_thing.held_again`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ from evercal.calibration.located import (
     shows_held_thing,
 )
 from evercal.calibration.verdict import verdict
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, deviations
 from evercal.geometry.camera import COEFFICIENTS
@@ -52,7 +53,7 @@ ENOUGH_IMAGES = 5
 """From this number of images, more images from one spot improve little."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class _View:
     """Images of one camera, located and fused."""
 

@@ -2,12 +2,12 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.image_files import image_files
@@ -19,7 +19,7 @@ ImageSource = PathLike | np.ndarray | Sequence[PathLike] | Sequence[np.ndarray]
 """A folder, an image file or an array (H, W, 3), or several files or arrays."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Images:
     """Images of one camera, with intrinsics and gripper poses if known."""
 

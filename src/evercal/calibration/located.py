@@ -2,12 +2,13 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from evercal.calibration.calibration import ImageUse
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import (
     SE3,
@@ -37,7 +38,7 @@ _LEAST_RAD = np.deg2rad(0.15)
 """Smaller angles to the mean, radians, are never outliers."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class ImagePose:
     """One image with its estimate, and the pose of it that is fused."""
 
@@ -54,7 +55,7 @@ class ImagePose:
         return self.estimate.base_from_camera is not None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Fused:
     """Robust mean of many poses of one transform."""
 

@@ -1,9 +1,9 @@
 """`evercal align`."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.errors import InputError
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from evercal.map import Map
 
 
-@dataclass(frozen=True)
+@frozen
 class Align(args.Verb):
     """Transform a scene in a frame of its own to the base frame.
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TextIO
 from tyro.conf import Positional, arg
 
 from evercal.bounds import VARIABLE, bounds
+from evercal.classes import frozen
 from evercal.cli.console import print_json, print_next, say
 from evercal.errors import InputError
 from evercal.processes import cores
@@ -107,7 +108,7 @@ class Verb:
             print_next("evercal", *then)
 
 
-@dataclass(frozen=True)
+@frozen
 class Reading:
     """How the recording is read; options that do not apply to its format are refused."""
 
@@ -161,7 +162,7 @@ class Reading:
 HowRead = Annotated[Reading, arg(name="")]
 
 
-@dataclass(frozen=True)
+@frozen
 class ArmGiven:
     """The arm that moved the gripper; its joints make errors that all images share."""
 

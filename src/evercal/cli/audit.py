@@ -1,17 +1,17 @@
 """`evercal audit`."""
 
 import dataclasses
-from dataclasses import dataclass
 from typing import Annotated
 
 from tyro.conf import arg
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.errors import InputError
 from evercal.progress import progress_bar
 
 
-@dataclass(frozen=True)
+@frozen
 class Audit(args.Verb):
     """List recorded episodes whose stated camera pose is wrong.
 

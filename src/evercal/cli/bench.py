@@ -2,12 +2,12 @@
 
 import dataclasses
 import itertools
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import say
 from evercal.errors import InputError
@@ -23,7 +23,7 @@ LEAST_BATCH = 64
 """Smallest number of rows in a step that learns anything."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Bench(args.Verb):
     """Compare strategies on a sequence of scenes; the same command resumes.
 

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
 from evercal.choices import MountName
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import numbers, require_writable, say_notes
 from evercal.errors import InputError
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
 
 
-@dataclass(frozen=True)
+@frozen
 class Calibrate(args.Verb):
     """Calibrate a camera from images of a mapped scene; no marker is needed.
 

@@ -1,12 +1,13 @@
 """`evercal check`."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.errors import InputError
 from evercal.progress import progress_bar
@@ -21,7 +22,7 @@ Reference = Annotated[
 ]
 
 
-@dataclass(frozen=True)
+@frozen
 class Check(args.Verb):
     """Test whether a fixed camera has moved since it was calibrated; exit code 1 if it has.
 

@@ -1,11 +1,11 @@
 """`evercal compare`."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.classes import frozen
 from evercal.cli import args
 
 _LINES = """\
@@ -19,7 +19,7 @@ _LINES = """\
 """Text of a `Comparison`, and of what both share."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Compare(args.Verb):
     """Compare two calibrations of one camera by their rays; exit code 1 if they disagree.
 

@@ -1,17 +1,18 @@
 """`evercal convert`."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.errors import InputError
 from evercal.progress import progress_bar
 
 
-@dataclass(frozen=True)
+@frozen
 class Convert(args.Verb):
     """Convert a recording of any format to evercal's own; it is scene.json and the images.
 

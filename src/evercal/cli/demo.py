@@ -5,10 +5,11 @@ import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import require_folder, say, size
 from evercal.errors import InputError
@@ -37,7 +38,7 @@ PICTURES = 3
 """Images of each room that the report shows."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Demo(args.Verb):
     """Map three rendered rooms, localize, calibrate, detect a bump.
 

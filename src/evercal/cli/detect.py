@@ -3,13 +3,13 @@
 import os
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
 from evercal.choices import BoardKind, CameraModel
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import numbers, require_writable
 from evercal.errors import InputError
@@ -31,7 +31,7 @@ _DICTIONARIES: dict[BoardKind, str] = {
 """Dictionaries of markers by default."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Detect(args.Verb):
     """Detect a printed board in images and estimate its pose in each.
 

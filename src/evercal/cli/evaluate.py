@@ -1,11 +1,11 @@
 """`evercal evaluate`."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import table
 from evercal.errors import InputError
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from evercal.recordings import Recording
 
 
-@dataclass(frozen=True)
+@frozen
 class Evaluate(args.Verb):
     """Measure the localization accuracy on the test frames of scenes.
 

@@ -1,13 +1,13 @@
 """`evercal export`."""
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
 from evercal.choices import Motors
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import say
 from evercal.errors import InputError, printable
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from evercal.calibration.export.formats import Exported
 
 
-@dataclass(frozen=True)
+@frozen
 class Export(args.Verb):
     """Write a calibration in the format of another program; `--format list` lists all formats.
 

@@ -1,19 +1,20 @@
 """`evercal eye-to-hand`."""
 
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.calibrate import at_record, calibration_lines, joint_lines
 from evercal.cli.console import require_writable
 from evercal.progress import Bars
 
 
-@dataclass(frozen=True)
+@frozen
 class EyeToHand(args.Verb):
     """Calibrate a fixed camera by any textured thing in the gripper; no board, no map.
 

@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import length, size, table
 
@@ -13,7 +13,7 @@ MEMORY_FILES = ("keyframes.safetensors", "state.safetensors")
 """Files of the keyframes: of a scene of a map, and of a store of networks."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Info(args.Verb):
     """Describe a map: scenes, size, and what bundle adjustment changed.
 

@@ -1,12 +1,13 @@
 """`evercal inspect`."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import numbers
 from evercal.errors import InputError
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from evercal.recordings.inspection import Inspection
 
 
-@dataclass(frozen=True)
+@frozen
 class Inspect(args.Verb):
     """Check a recording before it is learned; likely mistakes are named.
 

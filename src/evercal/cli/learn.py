@@ -3,7 +3,7 @@
 import dataclasses
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from evercal.choices import Preset
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.calibrate import joint_lines, lens_lines
 from evercal.cli.console import require_writable, say, say_notes, size
@@ -27,7 +28,7 @@ FEW_LANDMARKS = 50
 60, 100 and 90 % of the images were located."""
 
 
-@dataclass(frozen=True)
+@frozen
 class NetworkOptions:
     """Options of strategies that train a network; a map refuses them."""
 
@@ -50,7 +51,7 @@ class NetworkOptions:
                 )
 
 
-@dataclass(frozen=True)
+@frozen
 class Learn(args.Verb):
     """Learn a scene from a recording; scenes learned before do not change.
 

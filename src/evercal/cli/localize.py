@@ -4,11 +4,11 @@ import math
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Annotated
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import numbers, require_folder, require_writable
 from evercal.progress import progress_bar
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from evercal.reports.inspected import LearnedLocalizer
 
 
-@dataclass(frozen=True)
+@frozen
 class Localize(args.Verb):
     """Estimate the camera pose of images in the base frame.
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from evercal.choices import OnClash
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import require_writable, size
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 Archive = Annotated[Positional[Path], arg(metavar="FILE")]
 
 
-@dataclass(frozen=True)
+@frozen
 class Action(args.Verb):
     """An action on a map."""
 
@@ -37,7 +38,7 @@ class Action(args.Verb):
         return 0
 
 
-@dataclass(frozen=True)
+@frozen
 class List(Action):
     """List the scenes of a map with their size.
 
@@ -70,7 +71,7 @@ class List(Action):
         return 0
 
 
-@dataclass(frozen=True)
+@frozen
 class Remove(Action):
     """Remove scenes from a map, all in one step.
 
@@ -87,7 +88,7 @@ class Remove(Action):
         return self.done(cell, f"removed {', '.join(self.names)}")
 
 
-@dataclass(frozen=True)
+@frozen
 class Rename(Action):
     """Give a scene of a map another name.
 
@@ -106,7 +107,7 @@ class Rename(Action):
         return self.done(cell, f"renamed {self.name} to {self.new}")
 
 
-@dataclass(frozen=True)
+@frozen
 class Merge(Action):
     """Add the scenes of other maps to a map, all in one step; a new folder becomes a new map.
 
@@ -134,7 +135,7 @@ class Merge(Action):
         return self.done(cell, "; ".join(words), **dataclasses.asdict(merged))
 
 
-@dataclass(frozen=True)
+@frozen
 class Pack(Action):
     """Write a map into one file, a zip archive with checksums.
 
@@ -157,7 +158,7 @@ class Pack(Action):
         return 0
 
 
-@dataclass(frozen=True)
+@frozen
 class Unpack(Action):
     """Extract a map from a file of 'evercal map pack' into a new folder; every file is checked.
 

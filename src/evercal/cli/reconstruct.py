@@ -1,12 +1,12 @@
 """`evercal reconstruct`."""
 
 import dataclasses
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.progress import Bars
 
@@ -14,7 +14,7 @@ _CONNECTED = 0.8
 """Share of the frames that connect, below which a reconstruction has failed."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Reconstruct(args.Verb):
     """Estimate camera poses from a plain video or images, for a map.
 

@@ -2,12 +2,12 @@
 
 import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import length, size
 from evercal.errors import InputError
@@ -21,7 +21,7 @@ _LISTED = 5
 """Images left out that are printed."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Refresh(args.Verb):
     """Follow a changed room: new images replace what is gone.
 

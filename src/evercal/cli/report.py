@@ -1,11 +1,12 @@
 """`evercal report`."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import require_writable
 from evercal.progress import progress_bar
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from evercal.reports.calibration_images import AnnotatedImages, BoardSeen
 
 
-@dataclass(frozen=True)
+@frozen
 class Report(args.Verb):
     """Write an HTML report of a calibration: residuals and overlays.
 

@@ -1,8 +1,8 @@
 """`evercal serve`."""
 
 import os
-from dataclasses import dataclass
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.errors import InputError, missing_extra
 
@@ -10,7 +10,7 @@ TOKEN = "EVERCAL_TOKEN"
 """Environment variable of the bearer token."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Serve(args.Verb):
     """Serve a map over HTTP: localize, calibrate, check, track; see /docs of the service.
 

@@ -2,17 +2,18 @@
 
 import re
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.errors import InputError
 from evercal.progress import progress_bar
 
 
-@dataclass(frozen=True)
+@frozen
 class Simulate(args.Verb):
     """Record a virtual robot cell: wrist camera, fixed camera, truth.
 

@@ -2,11 +2,12 @@
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from evercal.choices import MountName
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.calibrate import calibration_lines
 from evercal.cli.console import require_writable, say_notes
@@ -18,7 +19,7 @@ _BY_IMAGE = ("camera_from_board", "leave_one_out_mm", "information_percent")
 """Checks with one value for each image."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Solve(args.Verb):
     """Calibrate a camera on or beside the robot from pairs of poses.
 

@@ -1,11 +1,11 @@
 """`evercal studio`: joins cameras and robot, real or virtual, with the page."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.view import PageVerb
 from evercal.errors import InputError
@@ -26,7 +26,7 @@ _REAL = (
 """Options that the virtual cell refuses."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Studio(PageVerb):
     """Calibrate wrist and fixed camera in the browser, step by step.
 

@@ -2,12 +2,12 @@
 
 from collections import Counter
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import numbers, require_writable, say
 from evercal.errors import InputError
@@ -22,7 +22,7 @@ MOST_RELOCALIZED = 1 / 3
 """Share of frames located from nothing above which the motion is too fast."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Track(args.Verb):
     """Locate the frames of a camera, video or folder one after another.
 

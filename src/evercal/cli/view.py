@@ -10,6 +10,7 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.errors import InputError, missing_extra
 
@@ -37,7 +38,7 @@ class PageVerb(args.Verb):
                 time.sleep(1.0)  # Ctrl-C does not end a wait without end on Windows
 
 
-@dataclass(frozen=True)
+@frozen
 class View(PageVerb):
     """Show a map, calibrations, arm and tracked camera in the browser.
 

@@ -6,13 +6,13 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
+from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.check import Reference, shift_line
 from evercal.cli.console import say
@@ -27,7 +27,7 @@ FALSE_ALARMS = 0.01
 """Probability of any false alarm while a folder is watched."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Watch(args.Verb):
     """Watch a folder of arriving images; stop with exit code 1 when the camera has moved.
 

@@ -2,12 +2,13 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from evercal.classes import frozen
 from evercal.continual.networks.descriptor import described
 from evercal.continual.networks.device import device_of
 from evercal.continual.networks.precision import autocast
@@ -25,7 +26,7 @@ from evercal.recordings.images import as_rgb
 from evercal.typing import Image
 
 
-@dataclass(frozen=True)
+@frozen
 class NetworkLocalizeOptions:
     """How networks locate an image."""
 

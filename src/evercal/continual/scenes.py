@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from evercal.classes import frozen
 from evercal.continual.networks.atlas import Atlas, Cell
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.descriptor import Descriptor
@@ -24,7 +25,7 @@ MAX_PROTOTYPES = 256
 """Maximum number of descriptors that are stored of a scene."""
 
 
-@dataclass(frozen=True)
+@frozen
 class SceneRecord:
     """A learned scene, without the weights of the head."""
 

@@ -2,10 +2,10 @@
 
 import importlib.util
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeGuard
 
+from evercal.classes import frozen
 from evercal.continual.methods.ewc import ElasticWeightConsolidation
 from evercal.continual.methods.gec import EpisodicConstraint
 from evercal.continual.methods.learning_without_forgetting import (
@@ -24,7 +24,7 @@ from evercal.continual.methods.replay import Replay
 from evercal.errors import InputError
 
 
-@dataclass(frozen=True)
+@frozen
 class Strategy:
     """What learning a scene does."""
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evercal.choices import Status
+from evercal.classes import frozen
 from evercal.geometry import SE3
 from evercal.geometry.near import COARSE
 from evercal.typing import BoolArray
@@ -31,7 +32,7 @@ CHI2_6 = 12.5916
 """95 % quantile of chi square with six degrees of freedom."""
 
 
-@dataclass(frozen=True)
+@frozen
 class FrameResult:
     """Result of one test image: errors are infinite without a pose in the right scene."""
 
@@ -61,7 +62,7 @@ class FrameResult:
         return self.status == "ok" and math.isinf(self.translation_error_m)
 
 
-@dataclass(frozen=True)
+@frozen
 class SceneScores:
     """Scores of one scene: per cent of its test frames, and medians over all of them."""
 
@@ -102,7 +103,7 @@ class Scores:
         return values
 
 
-@dataclass(frozen=True)
+@frozen
 class ContinualScores:
     """Accuracy and forgetting over a sequence of scenes, in the unit of the accuracies."""
 

@@ -3,10 +3,10 @@
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.evaluation.metrics import FrameResult
 from evercal.geometry import pose_distance
@@ -60,7 +60,7 @@ def evaluate(
     return [results[index] for index in range(len(tests))]
 
 
-@dataclass(frozen=True)
+@frozen
 class _Test:
     """A frame to localize."""
 

@@ -5,10 +5,10 @@ remain, but they are right where the encoder's cells mistake one square of a boa
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.geometry import Camera
 from evercal.typing import Array, Float32Array, Image, IntArray
 
@@ -26,7 +26,7 @@ MIN_INLIERS = 20
 """Minimum number of inliers of a pair of images."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class SiftFeatures:
     """Features of one image."""
 

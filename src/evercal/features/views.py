@@ -4,18 +4,19 @@ An augmented view is the image of a camera with another rotation and focal lengt
 centre. That image does not depend on the depths, so its pose is exact.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
+from evercal.classes import frozen
 from evercal.geometry.camera import Camera
 from evercal.geometry.se3 import SE3
 from evercal.recordings.frame import Frame
 from evercal.typing import Array, BoolArray, Image
 
 
-@dataclass(frozen=True)
+@frozen
 class ViewOptions:
     """Working size and augmentation."""
 
@@ -31,7 +32,7 @@ class ViewOptions:
     """Standard deviation of the logarithm of the brightness exponent."""
 
 
-@dataclass(frozen=True)
+@frozen
 class View:
     """One image for the encoder and the rays of its cells."""
 

@@ -2,8 +2,9 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.learning.located import localizer_of, located_as_stated
 from evercal.learning.report import LearnReport
@@ -18,7 +19,7 @@ from evercal.recordings.held_out import HeldOutSplit
 from evercal.recordings.pictures import look_at
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class LearnedScene:
     """A new scene, and how it came about."""
 

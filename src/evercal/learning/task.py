@@ -5,12 +5,13 @@ import logging
 import pickle
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError, printable
 from evercal.learning.report import LearnReport
 from evercal.learning.scene import learn_scene
@@ -27,7 +28,7 @@ _RESULT = "result"
 """Entry of a stored report: name of the file of results, which has the recording's digest."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Learned:
     """Outcome of one of many recordings."""
 
@@ -45,7 +46,7 @@ Item = tuple[int, Source]
 """A recording with its place among those given."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class LearnTask:
     """What is the same for all recordings."""
 

@@ -5,11 +5,11 @@ blurred, over- or underexposed, or show what another one shows.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
+from evercal.classes import frozen, frozen_arrays
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame
 from evercal.recordings.pictures import sharpness
@@ -31,7 +31,7 @@ SAME_DEG = 2.0
 """Rotation in degrees below which two samples may be duplicates."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Sample:
     """Pose and image quality of one frame, measured once."""
 
@@ -55,7 +55,7 @@ class Sample:
         )
 
 
-@dataclass(frozen=True)
+@frozen
 class SampleReport:
     """One row of a table of samples."""
 
@@ -68,7 +68,7 @@ class SampleReport:
     """Reasons to remove it; empty for a good sample."""
 
 
-@dataclass(frozen=True)
+@frozen
 class AxisCoverage:
     """One axis of rotation or translation."""
 
@@ -78,7 +78,7 @@ class AxisCoverage:
     covered: bool
 
 
-@dataclass(frozen=True)
+@frozen
 class Coverage:
     """Motions that a recording covers, its bad samples, and what to record next."""
 

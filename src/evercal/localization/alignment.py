@@ -1,11 +1,11 @@
 """Alignment: landmarks are searched in an image to a tenth of a pixel, then the pose is refined."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from evercal.classes import frozen
 from evercal.errors import InputError, require_numbers
 from evercal.geometry import SE3, Camera
 from evercal.localization.intrinsics import IntrinsicsPrior
@@ -40,7 +40,7 @@ _LOOSE_PNP = PnpOptions(threshold_px=4.0, max_iterations=200)
 """RANSAC settings for the matches of the coarse round, many of which are wrong."""
 
 
-@dataclass(frozen=True)
+@frozen
 class AlignmentRound:
     """One pass over the landmarks."""
 
@@ -56,7 +56,7 @@ class AlignmentRound:
     """Maximum distance of a match from its expected position, pixels of the image."""
 
 
-@dataclass(frozen=True)
+@frozen
 class AlignmentOptions:
     """How landmarks are searched in an image."""
 

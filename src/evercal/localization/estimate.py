@@ -6,13 +6,13 @@ from typing import Literal
 import numpy as np
 
 from evercal.choices import Status
+from evercal.classes import frozen_arrays, html_table
 from evercal.geometry import SE3, Camera, UncertainPose
-from evercal.notebook import html_table
 
 Cause = Literal["view", "lens", "map", "stated poses", "base frame"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class CovarianceTerm:
     """The share of one cause in the covariance of a pose."""
 

@@ -1,12 +1,12 @@
 """Hypotheses of a pose in one scene: by PnP, and by alignment of landmarks."""
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.localization import acceptance
 from evercal.localization.pose_refinement import Observed
@@ -34,7 +34,7 @@ NO_MATCHES = Matches(np.zeros((0, 2)), np.zeros((0, 3)))
 """Of a pose that did not start from matches."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Hypothesis:
     """A pose of the image, assuming that it shows one scene."""
 
@@ -66,7 +66,7 @@ class Hypothesis:
         return acceptance.support(self.inliers, self.expected)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Rough(Hypothesis):
     """A pose by PnP."""
 
@@ -77,7 +77,7 @@ class Rough(Hypothesis):
         return cls(scene, pose, *NO_MATCHES, expected=0, pnp_inliers=pnp_inliers)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Aligned(Hypothesis):
     """A pose by alignment of landmarks."""
 

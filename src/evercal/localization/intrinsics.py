@@ -6,11 +6,12 @@ together with the pose, to a thousandth. Where they contradict the prior, the pr
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, Protocol
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.typing import Array, Image
@@ -27,7 +28,7 @@ DOUBT = 3.0
 """Squared deviation, in variances, above which the prior is widened."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class IntrinsicsPrior:
     """Standard deviations of a camera's intrinsics about their stated values."""
 

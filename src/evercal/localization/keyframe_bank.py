@@ -2,13 +2,13 @@
 
 from collections import OrderedDict
 from copy import copy
-from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
 from typing import Self
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.features.encoder import Encoder
 from evercal.features.views import ideal_cell_pixels
 from evercal.geometry import SE3, Camera
@@ -25,7 +25,7 @@ _SAMPLED = 6
 """Every n-th landmark decides which keyframes see a view."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class MatchedCells:
     """Patches of a keyframe that an image is matched to, in the map's frame."""
 
@@ -35,7 +35,7 @@ class MatchedCells:
     """(cells, 3) surface points of the patches."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class AlignedLandmarks:
     """Landmarks of a keyframe that are searched in an image, in the map's frame."""
 

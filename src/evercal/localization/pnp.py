@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from evercal.classes import frozen
 from evercal.errors import require_numbers
 from evercal.geometry import SE3, Camera, UncertainPose, in_parent_axes
 from evercal.localization.pose_refinement import Pose, linearise
@@ -25,7 +25,7 @@ _RIDGE = 1e-6
 """Ridge of the information, pixels squared: without matches there is no step."""
 
 
-@dataclass(frozen=True)
+@frozen
 class PnpOptions:
     """RANSAC settings."""
 

@@ -1,10 +1,11 @@
 """Robust Gauss-Newton refinement of a camera's pose and intrinsics, with their covariance."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, UncertainPose, in_parent_axes
 from evercal.geometry.normal_equations import normal_inverse
 from evercal.localization.intrinsics import INTRINSICS
@@ -35,7 +36,7 @@ _RIDGE = 1e-12
 """Ridge of the scaled information: an unconstrained direction gets a huge variance."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Observed:
     """Landmarks observed in an image."""
 
@@ -49,7 +50,7 @@ class Observed:
     """Landmarks that should be visible and were searched."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Minimum:
     """Pose and intrinsics with the least errors, and the equations there."""
 

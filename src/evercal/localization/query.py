@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.features.views import working_grey
 from evercal.geometry import Camera
 from evercal.localization.intrinsics import IntrinsicsPrior
@@ -34,7 +35,7 @@ class Encoded:
     """Points and similarities of cells by stride and keyframe, see `Matcher`."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Query:
     """An image to be located."""
 

@@ -2,11 +2,12 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, average_poses, length_mm_deg
 from evercal.localization.estimate import PoseEstimate
@@ -33,7 +34,7 @@ WORSE = 0.1
 """Share of these images that the refreshed map may lose."""
 
 
-@dataclass(frozen=True)
+@frozen
 class RefreshReport:
     """Outcome of a refresh, as JSON values."""
 

@@ -1,9 +1,8 @@
 """Pose and intrinsics of an image; a prior of the intrinsics that is contradicted gives way."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.geometry import Camera, UncertainPose, in_parent_axes
 from evercal.localization.intrinsics import FREE, SAME_MODEL, IntrinsicsPrior
 from evercal.localization.pose_refinement import (
@@ -21,7 +20,7 @@ _REACHED = 0.05 * 7.815
 it: 5 % at the 95 % quantile of chi-squared with three degrees of freedom."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class RefinedPose:
     """A pose, intrinsics and the residuals of the observations."""
 

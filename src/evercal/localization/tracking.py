@@ -16,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 
+from evercal.classes import frozen, frozen_arrays
 from evercal.errors import require_numbers
 from evercal.features.views import working_grey
 from evercal.geometry import SE3, Camera, pose_distance
@@ -53,7 +54,7 @@ MOST_CHANGES = 15
 """Number of frames, the median of whose intrinsics the next one starts with."""
 
 
-@dataclass(frozen=True)
+@frozen
 class TrackOptions:
     """How a stream is tracked."""
 
@@ -79,7 +80,7 @@ class TrackOptions:
             require_numbers(self, ("at_most_ms",), 0)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class TrackedFrame:
     """A frame of a stream."""
 
@@ -96,7 +97,7 @@ class TrackedFrame:
     """Whether the smoothed pose was reset to this measurement."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class _Running:
     """A frame that is located in the background."""
 

@@ -4,12 +4,12 @@ import hashlib
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Self
 from uuid import uuid4
 
 from evercal.bounds import bounds, require_at_most
+from evercal.classes import frozen
 from evercal.errors import InputError, optional_module, without_secrets
 from evercal.storage.text_files import library_errors
 
@@ -25,7 +25,7 @@ def is_address(text: object) -> bool:
     return "://" in str(text)
 
 
-@dataclass(frozen=True)
+@frozen
 class RecordingAt:
     """A recording that is copied where it is learned."""
 

@@ -1,9 +1,10 @@
 """Before a recording is learned: its name, its frames and poses, and the held-out frames."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
+from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording, checked_name
 
@@ -17,7 +18,7 @@ BLOCK = 4
 Named = TypeVar("Named", bound="Recording | RecordingAt")
 
 
-@dataclass(frozen=True)
+@frozen
 class HeldOutSplit:
     """Training frames of a recording in two parts."""
 

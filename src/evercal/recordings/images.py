@@ -6,7 +6,6 @@ import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evercal.bounds import bounds, require_image_size
+from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.storage.atomic import naming_file, write_bytes
 from evercal.storage.text_files import named_errors, natural_key
@@ -48,7 +48,7 @@ class StoredImage(ABC):
         return None
 
 
-@dataclass(frozen=True)
+@frozen
 class UnturnedImage(StoredImage):
     """An image file as it is stored, for programs that ignore its EXIF orientation."""
 

@@ -2,12 +2,12 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from operator import attrgetter
 from typing import Literal
 
 import numpy as np
 
+from evercal.classes import frozen
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.geometry.near import near_training
 from evercal.recordings.frame import (
@@ -41,7 +41,7 @@ Owner = Literal["camera", "gripper", "none"]
 """Owner of the poses of a recording."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Inspection:
     """Summary of a recording."""
 

@@ -1,11 +1,12 @@
 """`load_recording`: recognise the format of a recording and read it."""
 
 import importlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
 from evercal.choices import FormatName
+from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.recordings.frame import Recording, with_images
 from evercal.recordings.read_options import ReadOptions
@@ -13,7 +14,7 @@ from evercal.storage.text_files import named_errors
 from evercal.typing import PathLike
 
 
-@dataclass(frozen=True)
+@frozen
 class RecordingFormat:
     """Recognition and reader of one format; its module is loaded on first use."""
 

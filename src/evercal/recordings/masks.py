@@ -3,12 +3,13 @@
 masks/NAME.png for images/NAME.jpg; also masks/NAME.jpg.png, as COLMAP names them
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import (
@@ -24,7 +25,7 @@ SOFT_PX = 9
 """Width of the soft edge of a mask, pixels: a hard edge would be texture."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class MaskedImage(StoredImage):
     """An image file without what is black in its mask."""
 

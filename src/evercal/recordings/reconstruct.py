@@ -11,13 +11,13 @@ import itertools
 import math
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from evercal.classes import frozen
 from evercal.errors import InputError, optional_module
 from evercal.recordings.images import write_image
 from evercal.recordings.pictures import is_blank
@@ -38,7 +38,7 @@ _CAMERA_MODEL = "OPENCV"
 """Model of the camera that all frames share."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Reconstruction:
     """Outcome, as JSON values."""
 

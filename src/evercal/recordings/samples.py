@@ -1,9 +1,9 @@
 """Sample recordings in the package: three rendered rooms and a robot cell with known answers."""
 
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
 
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.recordings.frame import Recording
 from evercal.recordings.load import load_recording
@@ -17,7 +17,7 @@ CELL = Path(__file__).parent / "sample_cell"
 `bumped.jpg` (the fixed camera after a bump) and `truth.json` (true poses)."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class SampleRoom:
     """The recordings of one sample room."""
 

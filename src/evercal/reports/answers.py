@@ -1,9 +1,10 @@
 """Answers as JSON values, the same on the command line and over the network."""
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from evercal.classes import frozen_arrays
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import ErrorTerm
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     from evercal.reports.inspected import LearnedLocalizer
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Answer:
     """One image and its estimate."""
 

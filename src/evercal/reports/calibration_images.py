@@ -1,7 +1,7 @@
 """Images of a calibrated camera with the axes of the parent frame and the landmarks drawn in."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -10,6 +10,7 @@ import numpy as np
 from evercal.calibration.boards.board_poses import read_board_poses
 from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.calibration import Calibration, ImageUse
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, resize_pixels
 from evercal.mapping.scene_map import SceneMap
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 MAX_IMAGES = 4
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class BoardSeen:
     """A board in one image."""
 
@@ -58,7 +59,7 @@ class ImageFile(NamedTuple):
     """Its entry in the calibration; None for other images."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class AnnotatedImages:
     """The images of a calibration with overlays."""
 

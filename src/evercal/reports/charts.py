@@ -1,11 +1,11 @@
 """Charts: panels with two axes, written by a template as SVG, or drawn into frames of a video."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.reports.overlay import overlay_lines
 from evercal.typing import Array, Image
 
@@ -52,7 +52,7 @@ class Shape(NamedTuple):
     """Of dots, and inside of an area."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Panel:
     """Shapes in a box with axes at the left and bottom; nothing is drawn outside."""
 

@@ -5,11 +5,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from statistics import median
 
+from evercal.classes import frozen
 from evercal.evaluation import FrameResult, scores
 from evercal.reports.page import Picture, Table, Tile, render
 
 
-@dataclass(frozen=True)
+@frozen
 class LearnedRoom:
     """The map of one room."""
 
@@ -24,7 +25,7 @@ class LearnedRoom:
     seconds: float
 
 
-@dataclass(frozen=True)
+@frozen
 class FixedCamera:
     """The calibration of a fixed camera and the check after a bump, compared with ground truth."""
 

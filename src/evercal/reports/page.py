@@ -3,10 +3,11 @@
 import base64
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
+from evercal.classes import frozen_arrays
 from evercal.errors import with_options
 from evercal.recordings.images import encode_jpeg
 from evercal.recordings.poses.row_files import is_number
@@ -34,7 +35,7 @@ class Picture(NamedTuple):
         return f"data:image/jpeg;base64,{data.decode()}"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Table:
     """A table. Columns of numbers are aligned right, columns without any value are hidden."""
 

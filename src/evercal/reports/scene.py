@@ -5,11 +5,12 @@ corrections of `mapping.map_frame`, usually about a millimetre.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Literal, NamedTuple, Self
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.mapping.scene_map import SceneMap
 from evercal.reports.charts import Panel, Shape
@@ -37,7 +38,7 @@ _DRAWN_POINTS = 6000
 """Landmarks in a chart, at most."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Frustum:
     """The view of a pinhole camera whose principal point is the centre of its image."""
 
@@ -63,7 +64,7 @@ class Frustum:
         return self.base_from_camera.apply(depth_m * rays)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Ellipsoid:
     """The translation of a pose within one standard deviation."""
 
@@ -103,7 +104,7 @@ def readable_scale(ellipsoids: list[Ellipsoid], drawn_m: float = DRAWN_M) -> int
     return 1
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Landmarks3D:
     """The landmarks of a scene."""
 
@@ -158,7 +159,7 @@ class Landmarks3D:
         return colour_map(values, (low, high))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class KeyframeView:
     """A keyframe of a scene."""
 
@@ -206,7 +207,7 @@ def _scale(scene: SceneMap) -> float:
     return similarity.scale
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Surroundings:
     """Landmarks and keyframes of a map; lengths in its unit."""
 

@@ -1,11 +1,12 @@
 """`Arm`: a chain of joints from the base to the gripper; poses, and how each joint moves them."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from evercal.classes import frozen_arrays
 from evercal.geometry import SE3
 from evercal.typing import Array, BoolArray
 
@@ -27,7 +28,7 @@ class MovingJoint(NamedTuple):
     """Offset of the motion, radians, or metres of sliding joints."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Arm:
     """Kinematics of an arm."""
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.geometry import SE3
 from evercal.robot.mount import Mount
 from evercal.typing import Array, BoolArray
@@ -26,7 +26,7 @@ class JointSlopes(NamedTuple):
     """(k,) offsets that the stated poses contain."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class ArmOffsets:
     """Estimated offsets of the k joints of an arm."""
 

@@ -1,16 +1,16 @@
 """Mounts of a camera: on the gripper, or fixed beside the arm."""
 
-from dataclasses import dataclass
 from typing import Literal
 
 from evercal.choices import MountName
+from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.geometry import SE3
 
 Frame = Literal["base", "gripper"]
 
 
-@dataclass(frozen=True)
+@frozen
 class Mount:
     """Which frame carries a camera, and in which frame its scene stands still."""
 

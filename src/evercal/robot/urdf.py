@@ -1,7 +1,6 @@
 """`parsed_urdf`: links and joints of a URDF, by one strict reading of its XML."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import NamedTuple
 from xml.parsers import expat
@@ -9,6 +8,7 @@ from xml.parsers import expat
 import numpy as np
 
 from evercal.bounds import require_at_most
+from evercal.classes import frozen_arrays
 from evercal.storage.text_files import naming
 
 _ENDS = (
@@ -48,7 +48,7 @@ class Element(NamedTuple):
     """Bytes of the file at which it and the elements in it begin; the first of each name counts."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Joint:
     """A joint."""
 

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,6 +23,7 @@ from evercal.bounds import RequestBounds
 from evercal.calibration import drift
 from evercal.calibration.from_images import calibrate
 from evercal.calibration.image_source import Images
+from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker
@@ -56,7 +56,7 @@ _NAME = 100
 """Characters of a file name that are kept."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Service:
     """What the endpoints share."""
 

@@ -6,7 +6,7 @@ import signal
 import socket
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 import uvicorn
@@ -19,6 +19,7 @@ from starlette.exceptions import HTTPException
 from starlette.staticfiles import StaticFiles
 
 from evercal.bounds import RequestBounds, TooLargeError, request_bounds
+from evercal.classes import frozen
 from evercal.errors import InputError, UnavailableError
 from evercal.service import hosts, routes
 from evercal.service.connection import protocols
@@ -36,7 +37,7 @@ LEAST_TOKEN = 16
 """Characters of a token, at least."""
 
 
-@dataclass(frozen=True)
+@frozen
 class ServeOptions:
     """How a map is served."""
 

@@ -1,11 +1,11 @@
 """Textured rectangles, the surfaces of box rooms: where rays hit them, and their images."""
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
 
+from evercal.classes import frozen
 from evercal.geometry import Camera
 from evercal.typing import Array, BoolArray, Image
 
@@ -27,7 +27,7 @@ Face = tuple[Array, Array, Array]
 """Corner and two edges of a rectangle, each (3,), metres."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Surface:
     """One textured rectangle in the base frame, visible from the side of its normal."""
 

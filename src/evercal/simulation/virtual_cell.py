@@ -6,11 +6,11 @@ that take time, and images. The truth is separate and serves tests.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator, default_rng
 
+from evercal.classes import frozen, frozen_arrays
 from evercal.errors import InputError, require_numbers
 from evercal.geometry import SE3
 from evercal.simulation.box_room import default_camera, look_at
@@ -59,7 +59,7 @@ _MOST_BLUR_STEPS = 16
 """Maximum number of steps between the copies of a blurred image."""
 
 
-@dataclass(frozen=True)
+@frozen
 class CellOptions:
     """Noise, image size and time of a virtual cell."""
 
@@ -87,7 +87,7 @@ class CellOptions:
         require_numbers(self, numbers, 0)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class CellTruth:
     """What a calibration should find."""
 

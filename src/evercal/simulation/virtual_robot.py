@@ -2,11 +2,11 @@
 
 import threading
 import time
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import default_rng
 
+from evercal.classes import frozen_arrays
 from evercal.geometry import SE3
 from evercal.simulation.panda_arm import HOME_RAD, base_from_flange, joints_for
 from evercal.typing import Array
@@ -38,7 +38,7 @@ class Clock:
             self._now_s += seconds
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Motion:
     """A motion of the joints from one pose to the next."""
 

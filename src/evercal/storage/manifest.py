@@ -10,11 +10,11 @@ that a changed manifest is detected too.
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 from typing import Any, Self
 
 from evercal.bounds import require_at_most
+from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.storage.atomic import write_json
 from evercal.typing import PathLike
@@ -34,7 +34,7 @@ def sha256_file(path: PathLike) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-@dataclass(frozen=True)
+@frozen
 class Manifest:
     """The content of a manifest."""
 

@@ -11,10 +11,10 @@
   board in that of OpenCV's `GridBoard`, whose rows go down.
 """
 
-from dataclasses import dataclass
 from typing import Any, Self, get_args
 
 from evercal.choices import BoardKind
+from evercal.classes import frozen
 from evercal.errors import InputError
 
 _LEAST_COUNT = {
@@ -33,7 +33,7 @@ _MOST_M = 2.0
 """Maximum side of a square or marker, metres: above, the unit is wrong."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Board:
     """A printed board."""
 

@@ -14,7 +14,6 @@ neighbours.
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -28,6 +27,7 @@ from evercal.calibration.boards.corners import (
     strays,
 )
 from evercal.calibration.boards.row_shift import CornerNoise
+from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
@@ -37,7 +37,7 @@ FORMAT = "evercal-board-poses"
 VERSION = 1
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class BoardImage:
     """One image; without a board, only `name` and `reason` are set."""
 
@@ -54,7 +54,7 @@ class BoardImage:
     """Pixels x, y of corners that leave their neighbours by many sigma."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class BoardPoses:
     """Board poses of all images of one camera."""
 

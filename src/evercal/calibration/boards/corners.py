@@ -6,7 +6,6 @@ intrinsics, see `evercal.calibration.boards.intrinsics`.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import factorial
 from typing import NamedTuple, TypeAlias
 
@@ -15,6 +14,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
+from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, cross_matrix
 from evercal.geometry.normal_equations import normal_pseudo_inverse
 from evercal.typing import Array, BoolArray
@@ -35,7 +35,7 @@ _MIN_STEP = 1e-10
 """Step, radians and metres, below which they end."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class BoardView:
     """Four or more corners of a board in one image."""
 
@@ -82,7 +82,7 @@ class CornerSlopes(NamedTuple):
     and a roll and a zoom that shift what is one height from the principal point as far."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class BoardPose:
     """Least-squares pose of the board in one image."""
 

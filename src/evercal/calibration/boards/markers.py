@@ -1,7 +1,7 @@
 """Detect boards of markers: tags, grids and ChArUco boards."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from evercal.calibration.boards.marker_layout import (
     Plane,
     layout_of,
 )
+from evercal.classes import frozen_arrays
 from evercal.typing import Array, BoolArray, Image, IntArray
 
 _THRESHOLDS = (15, 40, 7)
@@ -29,7 +30,7 @@ _NEAREST = 4
 """Number of neighbours of a marker that are compared."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class CharucoView(BoardView):
     """Corners of a ChArUco board, and what is wrong with the size of its markers."""
 

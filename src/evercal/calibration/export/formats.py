@@ -1,7 +1,6 @@
 """The table of export formats, and `export_files`."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias, Unpack
 
@@ -11,6 +10,7 @@ from evercal.calibration.export.read_back import require_read_back
 from evercal.calibration.export.request import Export, ExportOptions, prepare_export
 from evercal.calibration.framed_pose import FramedPose
 from evercal.choices import ExportFormat
+from evercal.classes import frozen, frozen_arrays
 from evercal.errors import InputError
 from evercal.storage import write_bytes
 from evercal.typing import PathLike
@@ -21,7 +21,7 @@ _HOLD_INTRINSICS = ("camera_info", "opencv", "colmap", "nerfstudio")
 """Formats that hold the intrinsics which their pose is for."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Exporter:
     """One export format; every format takes fixed cameras and cameras on the arm."""
 
@@ -110,7 +110,7 @@ FORMATS: dict[str, Exporter] = {
 """All formats by name, an `ExportFormat`."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Exported:
     """A calibration with the exported frames in another format."""
 

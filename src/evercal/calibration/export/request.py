@@ -7,7 +7,7 @@ x right, y down, z forward. The offset between their origins is in `/tf_static` 
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any, TypeAlias, TypedDict, Unpack
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from evercal.calibration.framed_pose import FramedPose
 from evercal.choices import Motors
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.cameras.camera_file import read_camera
@@ -64,7 +65,7 @@ class ExportOptions(TypedDict, total=False):
     """Motors of that arm, which subtract the homing offset or add it."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Export:
     """A calibration with what a format writer may need, see `ExportOptions`."""
 

@@ -8,7 +8,7 @@ Alternatively, points that the tool has touched are picked in images.
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from evercal.calibration.located import ImagePose, locate, poses_of
 from evercal.calibration.pose_pairs.fit import HandEyeFit
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solve import solve_pose_pairs
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, axis_deviation, cross_matrix
 from evercal.localization.intrinsics import cameras_in_scenes
@@ -35,7 +36,7 @@ LEAST_LOCATED = 5
 """Least number of located images that align a map."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class MapAlignment:
     """Pose and scale of a map in the base frame."""
 

@@ -7,7 +7,7 @@ bundle adjustment refines it together with all poses and landmarks.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
@@ -20,6 +20,7 @@ from evercal.calibration.framed_pose import ImageUse, JointOffset
 from evercal.calibration.from_map.hand_eye_start import HandEyeStart
 from evercal.calibration.from_map.next_views import open_position
 from evercal.calibration.verdict import verdict
+from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, UncertainPose, length_mm_deg, pose_distance_mm_deg
 from evercal.mapping.built_map import (
     MOST_FOCAL_PERCENT,
@@ -34,7 +35,7 @@ MOST_POSE_SIGMA_MM = 5.0
 """A larger standard deviation of gripper positions indicates such errors, too; millimetres."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class HandEye:
     """A calibration from images and gripper poses alone, and how it was estimated."""
 

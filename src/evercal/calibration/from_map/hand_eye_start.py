@@ -9,7 +9,7 @@ thing that the gripper holds, with the inverse poses.
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from evercal.calibration.from_map.image_pairs import (
     image_pairs,
 )
 from evercal.calibration.pose_pairs.checks import require_rotations
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.geometry import SE3
@@ -54,7 +55,7 @@ SURE_SHARE = 0.8
 pairs can agree."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class HandEyeStart:
     """A first transform from the camera to what it is mounted on."""
 

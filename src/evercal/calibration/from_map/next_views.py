@@ -16,10 +16,9 @@ error of the scene's scale, which images do not show, and m the position of the 
 frame: where the arm orbits one place, m hardly changes, and X is open in its direction.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from evercal.classes import frozen, frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import (
     SE3,
@@ -67,7 +66,7 @@ _APART_DEG = 4.0
 """Angle between poses that are one, degrees."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class NextViews:
     """Poses to go to, in order."""
 
@@ -105,7 +104,7 @@ def next_views(
     )
 
 
-@dataclass(frozen=True)
+@frozen
 class OpenPosition:
     """The direction in which the motions of a recording leave `gripper_from_camera` open."""
 

@@ -5,7 +5,6 @@ held: the map is a board of known shape, so this is `solve` for pose pairs.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from evercal.calibration.located import ImagePose, poses_of
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.solution import PairSolution
 from evercal.calibration.pose_pairs.solve import solve_pose_pairs
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import SE3, length_mm_deg
 
@@ -26,7 +26,7 @@ _LEAST_DEG = 0.1
 """Smaller rotations of a grip, degrees, do not count."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class HeldAgain:
     """Camera and grip, from images of a thing that is held another way."""
 

@@ -7,13 +7,14 @@ window around it (`windows`) makes a thing of a few pixels as large as the encod
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.classes import frozen_arrays
 from evercal.recordings.frame import Frame
 from evercal.recordings.images import Picture, StoredImage, pixels_of
 from evercal.recordings.masks import without
@@ -35,7 +36,7 @@ LONG_SIDE = 640
 """Long side at which images are compared, pixels."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class MovingPart(StoredImage):
     """An image without what stands still; it is read again each time."""
 

@@ -1,6 +1,6 @@
 """Read pose pairs from a file of robot poses and a file of camera poses."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Literal
 
@@ -13,6 +13,7 @@ from evercal.calibration.boards.board_poses import (
 )
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PoseNumbers, PosePairs
 from evercal.calibration.pose_pairs.time_offset import CameraTrack, interpolated_pairs
+from evercal.classes import frozen, frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.conventions import PoseConvention
@@ -30,7 +31,7 @@ from evercal.typing import Array, BoolArray, IntArray
 Inverted = Literal["robot", "camera", "both"]
 
 
-@dataclass(frozen=True)
+@frozen
 class PairFiles:
     """Files of pose pairs and their conventions."""
 
@@ -45,7 +46,7 @@ class PairFiles:
     """Files that hold inverted poses: gripper_from_base, board_from_camera."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class _Poses:
     """The n poses of a table, or of a file of `evercal detect`."""
 

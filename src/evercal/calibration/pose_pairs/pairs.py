@@ -27,6 +27,7 @@ from evercal.calibration.boards.intrinsics import (
 )
 from evercal.calibration.boards.row_shift import CornerNoise
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation
+from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.poses.conventions import PoseConvention
 from evercal.robot.mount import MountName, mount_named
@@ -42,7 +43,7 @@ _SAME_CAMERA_RAD = np.deg2rad(0.5)
 """Angle below which two camera poses are equal."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class PoseNumbers:
     """The numbers of a pose file, for messages about its convention."""
 
@@ -191,7 +192,7 @@ def _canonical(pose: SE3) -> Array:
     return quaternion * np.where(largest < 0, -1.0, 1.0)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class BoardCorners:
     """Board corners of the images of pose pairs."""
 

@@ -5,7 +5,7 @@ angles between successive images are compared with the robot's angles. The best 
 refined together with the transforms.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from evercal.calibration.calibration import Calibration
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.readings import steps_rad
 from evercal.calibration.pose_pairs.solve import solve_pose_pairs
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import PoseTrack
@@ -33,7 +34,7 @@ _MAX_CHANGE_S = 0.02
 """Maximum change of the offset in the last of them."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class CameraTrack:
     """Board poses of images with time stamps."""
 

@@ -14,13 +14,14 @@ each takes runs that no other has.
 
 import json
 from collections.abc import Generator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 from filelock import FileLock, Timeout
 
+from evercal.classes import frozen
 from evercal.continual.benchmark import results
 from evercal.continual.benchmark.results import Table
 from evercal.continual.benchmark.strategy_run import (
@@ -52,7 +53,7 @@ ACCEPTANCE = (
 """Constants of `localization.acceptance` that decide which poses are answers."""
 
 
-@dataclass(frozen=True)
+@frozen
 class CompletedStage:
     """A complete stage."""
 

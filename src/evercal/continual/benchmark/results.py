@@ -12,7 +12,6 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ import numpy as np
 import pandas as pd
 from filelock import FileLock
 
+from evercal.classes import frozen_arrays
 from evercal.continual.benchmark.environment import environment
 from evercal.errors import InputError
 from evercal.evaluation import metrics
@@ -64,7 +64,7 @@ _REQUIRED = {
 """Columns that results.csv must have."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class StageResults:
     """Results of all scenes learned so far, after one stage of a run."""
 

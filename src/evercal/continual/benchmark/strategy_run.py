@@ -3,7 +3,7 @@
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -11,6 +11,7 @@ from typing import Literal
 import pandas as pd
 from filelock import FileLock
 
+from evercal.classes import frozen
 from evercal.continual.benchmark.results import (
     UNALIGNED,
     StageResults,
@@ -51,7 +52,7 @@ whose inliers stay above the threshold that was fitted when a scene was learned.
 Order = Literal["given", "reversed", "shuffled", "balanced"]
 
 
-@dataclass(frozen=True)
+@frozen
 class BenchOptions:
     """Options of a benchmark."""
 

@@ -1,12 +1,13 @@
 """Suites: named sequences of scenes for comparing strategies."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import compress
 from pathlib import Path
 
 import numpy as np
 
+from evercal.classes import frozen
 from evercal.continual.benchmark.sfm_poses import with_sfm_poses
 from evercal.errors import InputError
 from evercal.recordings import (
@@ -21,7 +22,7 @@ from evercal.recordings.samples import sample_rooms
 from evercal.typing import Array
 
 
-@dataclass(frozen=True)
+@frozen
 class Suite:
     """A named sequence of scenes."""
 

@@ -2,9 +2,10 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
+from evercal.classes import frozen
 from evercal.continual.learning.learn import learn
 from evercal.continual.learning.presets import preset, short_side
 from evercal.continual.learning.stage import OnEvent, StageOptions, unobserved
@@ -25,7 +26,7 @@ from evercal.recordings.held_out import named_recording, require_frames, split_h
 from evercal.storage.stages import is_store
 
 
-@dataclass(frozen=True)
+@frozen
 class NetworkReport(LearnReport):
     """Outcome of learning a scene into networks."""
 
@@ -35,7 +36,7 @@ class NetworkReport(LearnReport):
     """Size of the networks."""
 
 
-@dataclass(frozen=True)
+@frozen
 class NetworkLearnOptions:
     """How a scene is learned into a store of networks."""
 

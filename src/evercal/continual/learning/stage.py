@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+from evercal.classes import frozen
 from evercal.continual.networks.buffer import EncodePlan
 from evercal.continual.networks.head import HeadOptions
 from evercal.continual.networks.trainer import FitOptions, Progress
@@ -10,7 +11,7 @@ from evercal.errors import require_numbers
 from evercal.mapping.memory_budget import MemoryBudget
 
 
-@dataclass(frozen=True)
+@frozen
 class StageOptions:
     """Options of one stage."""
 

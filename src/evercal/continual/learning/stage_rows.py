@@ -1,8 +1,9 @@
 """Feature rows of a stage: of the new scene's frames, and of remembered keyframes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+from evercal.classes import frozen
 from evercal.continual.learning.stage import Encoding, OnEvent, StageOptions, unobserved
 from evercal.continual.networks.atlas import Cell
 from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, encode_frames
@@ -10,7 +11,7 @@ from evercal.continual.scenes import LearnedScenes
 from evercal.recordings.frame import Frame
 
 
-@dataclass(frozen=True)
+@frozen
 class StageRows:
     """Encodes frames with the networks of scenes and the options of a stage."""
 

@@ -1,11 +1,11 @@
 """EWC: weights are tied to earlier values in proportion to their importance."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import torch
 from torch import Generator, Tensor
 
+from evercal.classes import frozen
 from evercal.continual.methods.method import FinishedScene, Method, StageStart
 from evercal.continual.networks.buffer import random_indices
 from evercal.continual.networks.hooks import TrainingHooks
@@ -15,7 +15,7 @@ IMAGE_ROWS = 256
 """Rows of each image from which a gradient is computed."""
 
 
-@dataclass(frozen=True)
+@frozen
 class ElasticWeightConsolidation(Method):
     """The cost is strength / 2 x mean over weights of sum_s I_s (w - w_s)^2.
 

@@ -7,12 +7,12 @@ scene t by <g_t, u>, with g_t the gradient of that loss.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Generator, Tensor
 
+from evercal.classes import frozen
 from evercal.continual.methods.method import FinishedScene, StageStart
 from evercal.continual.methods.penalties import Reprojection
 from evercal.continual.methods.replay import EpisodicMemory, MemoryHooks
@@ -25,7 +25,7 @@ REFERENCE_ROWS = 8192
 """Rows of the keyframes from which the loss after learning a scene is computed."""
 
 
-@dataclass(frozen=True)
+@frozen
 class EpisodicConstraint(EpisodicMemory):
     """GEC with several constraints and the references of its appendix.
 

@@ -1,10 +1,9 @@
 """Learning without forgetting: distillation of the old head on new images."""
 
-from dataclasses import dataclass
-
 import torch
 from torch import Generator, Tensor
 
+from evercal.classes import frozen
 from evercal.continual.methods.method import Method, StageStart
 from evercal.continual.methods.penalties import PX_PER_M
 from evercal.continual.methods.replay import teacher_output
@@ -13,7 +12,7 @@ from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
 
 
-@dataclass(frozen=True)
+@frozen
 class LearningWithoutForgetting(Method):
     """LwF for points: new rows with the code of an old scene keep the output of the old head.
 

@@ -6,11 +6,12 @@ keyframes.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from typing import ClassVar
 
 from torch import Tensor
 
+from evercal.classes import frozen
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
 from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
@@ -21,7 +22,7 @@ MethodState = Mapping[str, Tensor]
 """Named tensors that a method stores with a finished scene; they count as memory."""
 
 
-@dataclass(frozen=True)
+@frozen
 class StageStart:
     """Inputs of a method before a scene is learned."""
 
@@ -39,7 +40,7 @@ class StageStart:
     """Seed of the stage."""
 
 
-@dataclass(frozen=True)
+@frozen
 class FinishedScene:
     """Inputs of a method after a scene was learned."""
 
@@ -59,7 +60,7 @@ class FinishedScene:
         return self.head(rows.features.float(), self.number, rows.descriptor)
 
 
-@dataclass(frozen=True)
+@frozen
 class Method:
     """Base of all methods: trains on the new scene alone and stores nothing."""
 
@@ -83,14 +84,14 @@ class Method:
         return {}
 
 
-@dataclass(frozen=True)
+@frozen
 class FineTuning(Method):
     """Trains on each new scene from the weights after the last one."""
 
     citation = "control: the same head and steps, no replay"
 
 
-@dataclass(frozen=True)
+@frozen
 class Isolation(Method):
     """A head per scene, initialised from the last one; scenes share no weights."""
 

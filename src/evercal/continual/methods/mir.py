@@ -1,11 +1,11 @@
 """Maximally interfered retrieval: replay of views that a step on new rows harms most."""
 
 import copy
-from dataclasses import dataclass
 
 import torch
 from torch import Generator, Tensor
 
+from evercal.classes import frozen
 from evercal.continual.methods.method import StageStart
 from evercal.continual.methods.replay import Replay, ReplayHooks
 from evercal.continual.networks.buffer import FeatureBuffer, Rows, random_indices
@@ -14,7 +14,7 @@ from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.networks.loss import fixed_clamp_loss
 
 
-@dataclass(frozen=True)
+@frozen
 class MaximallyInterferedRetrieval(Replay):
     """MIR (Aljundi et al., 2019): replays the views whose loss a virtual step raises most.
 

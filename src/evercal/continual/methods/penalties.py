@@ -1,12 +1,13 @@
 """Losses of replayed rows, each a small frozen dataclass."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from evercal.classes import frozen
 from evercal.continual.methods.spdd import SpddOptions, spdd_loss
 from evercal.continual.networks.buffer import Rows
 from evercal.continual.networks.head import HeadOutput
@@ -21,7 +22,7 @@ PX_PER_M = 50.0
 is about as many pixels in the image."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Penalty:
     """Loss of replayed rows; subclasses implement it."""
 
@@ -50,7 +51,7 @@ def _reprojection(student: HeadOutput, rows: Rows, tau_px: float) -> Tensor:
     return loss.mean()
 
 
-@dataclass(frozen=True)
+@frozen
 class Reprojection(Penalty):
     """The reprojection loss of new rows, with the same schedule of the clamp."""
 
@@ -62,7 +63,7 @@ class Reprojection(Penalty):
         return _reprojection(student, rows, tau_px)
 
 
-@dataclass(frozen=True)
+@frozen
 class OldOutput(Penalty):
     """iCaRL for points: reprojection loss plus L1 distance to the old model's points.
 
@@ -80,7 +81,7 @@ class OldOutput(Penalty):
         return _reprojection(student, rows, tau_px) + self.px_per_m * distance
 
 
-@dataclass(frozen=True)
+@frozen
 class BoundedByTeacher(Penalty):
     """Buff-CS: reprojection loss, and distance to the teacher where the teacher is more accurate.
 
@@ -102,7 +103,7 @@ class BoundedByTeacher(Penalty):
         return 0.5 * reprojection + 0.5 * self.px_per_m * bounded
 
 
-@dataclass(frozen=True)
+@frozen
 class Relations(Penalty):
     """Co2L for points: reprojection loss, and similarity between rows.
 
@@ -138,7 +139,7 @@ class Relations(Penalty):
         return _reprojection(student, rows, tau_px) + divergence
 
 
-@dataclass(frozen=True)
+@frozen
 class AnchoredReprojection(Penalty):
     """Reprojection loss, and distance to the teacher's points where these were accurate.
 
@@ -164,7 +165,7 @@ class AnchoredReprojection(Penalty):
         return cost.mean() + self.px_per_m * anchored.mean()
 
 
-@dataclass(frozen=True)
+@frozen
 class Distillation(Penalty):
     """SPDD, the complete replay loss of the paper (Algorithm 2), without reprojection.
 

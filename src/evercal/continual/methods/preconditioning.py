@@ -1,11 +1,12 @@
 """Replay with steps that are damped along the inputs of remembered scenes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import torch
 from torch import Tensor, nn
 
+from evercal.classes import frozen
 from evercal.continual.methods.method import StageStart
 from evercal.continual.methods.penalties import AnchoredReprojection, Penalty
 from evercal.continual.methods.replay import Replay, ReplayHooks
@@ -17,7 +18,7 @@ ROWS = 8192
 """Rows of a scene from which second moments are estimated."""
 
 
-@dataclass(frozen=True)
+@frozen
 class PreconditionedReplay(Replay):
     """Anchored replay of SARS keyframes with preconditioned steps."""
 

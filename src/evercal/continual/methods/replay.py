@@ -3,11 +3,12 @@
 Most methods differ only in the selected frames and the loss of replayed rows; both are fields.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import torch
 from torch import Generator, Tensor
 
+from evercal.classes import frozen
 from evercal.continual.methods.method import Method, StageStart
 from evercal.continual.methods.penalties import Penalty, Reprojection
 from evercal.continual.networks.buffer import Rows
@@ -19,7 +20,7 @@ from evercal.continual.selection.selectors import SELECTORS
 from evercal.typing import IntArray
 
 
-@dataclass(frozen=True)
+@frozen
 class EpisodicMemory(Method):
     """Base of methods that use keyframes during training."""
 
@@ -56,7 +57,7 @@ class MemoryHooks(TrainingHooks):
         return [memory.draw(self.each, generator) for memory in self.memories]
 
 
-@dataclass(frozen=True)
+@frozen
 class Replay(EpisodicMemory):
     """Replays keyframes (Chaudhry et al., On tiny episodic memories, 2019)."""
 

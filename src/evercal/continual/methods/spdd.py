@@ -4,16 +4,15 @@ SPDD is the complete replay loss of the paper; it contains no reprojection error
 summed over active centres and coordinates and averaged over rows.
 """
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
+from evercal.classes import frozen
 from evercal.continual.networks.head import HeadOutput
 from evercal.errors import require_numbers
 
 
-@dataclass(frozen=True)
+@frozen
 class SpddOptions:
     """Weights and settings of the distillation loss; the defaults are the paper's."""
 
@@ -35,7 +34,7 @@ class SpddOptions:
         require_numbers(self, ("active_centres",), 1)
 
 
-@dataclass(frozen=True)
+@frozen
 class SpddTerms:
     """The terms of the loss, each a scalar without its weight, and their weighted sum."""
 

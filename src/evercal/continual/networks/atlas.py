@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 
+from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.geometry.se3 import SE3
 from evercal.typing import Array
@@ -18,7 +19,7 @@ MIN_CELL_M = 5.0
 """Minimum side of a scene's cell, and distance of the positions of cells, metres."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Cell:
     """The square of the atlas that belongs to one scene."""
 

@@ -9,6 +9,7 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
+from evercal.classes import frozen
 from evercal.continual.networks.descriptor import Descriptor, described
 from evercal.continual.networks.loss import Target, radial_factor
 from evercal.errors import require_numbers
@@ -216,7 +217,7 @@ def diffused(rows: Rows, deviation: float, generator: Generator) -> Rows:
     return replace(rows, descriptor=F.normalize(noisy, dim=-1))
 
 
-@dataclass(frozen=True)
+@frozen
 class EncodePlan:
     """How a buffer is filled."""
 

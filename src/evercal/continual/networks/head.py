@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from evercal.classes import frozen
 from evercal.errors import InputError, require_numbers
 
 SCALE_MAX = 4.0
@@ -31,7 +32,7 @@ PER_CENTRE = ("logit", "logit_bias", "offset", "offset_bias")
 """Parameters with a row for each centre; with shared offsets only the first two."""
 
 
-@dataclass(frozen=True)
+@frozen
 class HeadOptions:
     """Architecture of a head."""
 

@@ -7,6 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from evercal.classes import frozen
 from evercal.errors import require_numbers
 
 MIN_DEPTH_M = 0.1
@@ -23,7 +24,7 @@ MAX_RADIUS2 = 1.0
 """Squared radius in the normalised image plane beyond which the distortion is constant."""
 
 
-@dataclass(frozen=True)
+@frozen
 class LossOptions:
     """Robust reprojection loss."""
 

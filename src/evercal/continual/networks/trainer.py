@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Generator, Tensor
 
+from evercal.classes import frozen
 from evercal.continual.networks.buffer import FeatureBuffer, Rows, diffused, join
 from evercal.continual.networks.device import tf32
 from evercal.continual.networks.head import Head
@@ -27,7 +28,7 @@ CORRECTION_FROM_PX = 20.0
 """Soft clamp below which the camera is corrected. Earlier errors come from the points."""
 
 
-@dataclass(frozen=True)
+@frozen
 class FitOptions:
     """One stage of training."""
 

@@ -14,12 +14,12 @@ import functools
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError, optional_module
 from evercal.recordings.cameras.camera_file import read_camera_of_size
 from evercal.recordings.formats.lerobot_poses import Info, feature_poses, pose_feature
@@ -233,7 +233,7 @@ def _row_group(path: Path, group: int, key: str) -> list[Any]:
         return table.read_row_group(group, columns=[key])[key].to_pylist()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class _Embedded(StoredImage):
     """An image file in a cell of a table."""
 

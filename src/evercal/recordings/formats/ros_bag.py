@@ -8,13 +8,14 @@ image stamps from /tf and /tf_static, or from /joint_states with a URDF. If the 
 frame of the images themselves, the poses are base_from_camera. Images stay in the bag until needed.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.recordings.cameras.camera_file import (
@@ -113,7 +114,7 @@ def load(root: Path, options: ReadOptions) -> Recording:
     return Recording(name, tuple(frames), (), lost, notes=tuple(notes), arm=arm)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class BagImage(StoredImage):
     """One image message in a bag, see `Message`."""
 

@@ -2,13 +2,13 @@
 
 import threading
 from collections import OrderedDict
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from evercal.bounds import require_image_size
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError, optional_module
 from evercal.recordings.images import StoredImage
 from evercal.typing import Image
@@ -19,7 +19,7 @@ _READ_AHEAD_S = 1.0
 """Within this time ahead, decoding frame by frame is cheaper than seeking, seconds."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class VideoFrame(StoredImage):
     """One frame of a video."""
 

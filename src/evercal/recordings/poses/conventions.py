@@ -10,7 +10,7 @@ script manual, RoboDK's converters (Staubli, Kawasaki) and libfranka's reference
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from difflib import get_close_matches
 from itertools import chain, product
 from typing import Any
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from evercal.classes import frozen
 from evercal.geometry.se3 import SE3
 from evercal.recordings.poses.row_files import by_alias
 from evercal.typing import Array, BoolArray
@@ -29,7 +30,7 @@ OPENGL_FROM_OPENCV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
 """Rotation between the camera axes of OpenGL and OpenCV; its own inverse."""
 
 
-@dataclass(frozen=True)
+@frozen
 class PoseConvention:
     """How numbers represent a pose."""
 

@@ -1,11 +1,10 @@
 """Poses over time, with interpolation."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Slerp
 
+from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, pose_distance
 from evercal.typing import Array, BoolArray
 
@@ -17,7 +16,7 @@ STILL_DEG = 0.1
 """The same for rotations, degrees."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class PoseTrack:
     """A pose over time; of several poses at one time, the last is kept."""
 

@@ -7,12 +7,12 @@ one such file for each pose. docs/formats.md has examples of all kinds.
 import os
 import re
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from evercal.choices import ConventionName
+from evercal.classes import frozen_arrays
 from evercal.geometry import SE3
 from evercal.recordings.images import files_in
 from evercal.recordings.poses.array_files import arrays_as_lists
@@ -59,7 +59,7 @@ _UNTRACKED = re.compile(r"(?i)\b(?:nan|inf)\b|1\.?#(?:IND|INF|[QS]NAN)")
 """A number in a file of one pose that an image lacks, also as Windows prints it."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class RobotPoses:
     """Poses in the order of their file."""
 

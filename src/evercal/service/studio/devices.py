@@ -2,9 +2,9 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Literal
 
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg
 from evercal.live.camera import LiveCamera
@@ -19,7 +19,7 @@ STILL_DEG = 0.05
 """Change of the gripper's rotation, in degrees, below which the arm stands still."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Devices:
     """Cameras and the robot."""
 

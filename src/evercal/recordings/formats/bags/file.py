@@ -3,10 +3,10 @@
 import threading
 import weakref
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from evercal.classes import frozen
 from evercal.errors import InputError, optional_module
 from evercal.recordings.images import files_in
 from evercal.storage.text_files import few, library_errors
@@ -28,7 +28,7 @@ TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 """Types of transforms in ROS 2 and 1."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Message:
     """One message of a bag."""
 

@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple, NoReturn
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.formats.bags.file import JOINT_STATE, TF, BagFile
@@ -209,7 +210,7 @@ def plain_name(frame: str) -> str:
     return frame.lstrip("/")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class ImagePoses:
     """Poses at the images of a bag."""
 
