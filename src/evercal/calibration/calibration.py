@@ -99,7 +99,7 @@ class Calibration(FramedPose):
         mount_named(self.mount)
         if isinstance(self.checks, Mapping):
             object.__setattr__(self, "checks", checks_of(self.checks))
-        covariance = np.array(self.covariance, dtype=np.float64)
+        covariance = np.array(self.covariance, float)
         if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
             raise ValueError(
                 f"a covariance is (6, 6) and finite, got {covariance.shape}"
@@ -118,7 +118,7 @@ class Calibration(FramedPose):
             )
         object.__setattr__(self, "covariance", covariance)
         k = len(self.joints)
-        of_joints = np.array(self.joint_covariance, dtype=np.float64)
+        of_joints = np.array(self.joint_covariance, float)
         if of_joints.size != k * k:
             raise ValueError(
                 f"the covariance of {k} joints is ({k}, {k}), got {of_joints.shape}"
@@ -205,7 +205,7 @@ class Calibration(FramedPose):
         return cls(
             mount=data["mount"],
             parent_from_child=pose,
-            covariance=np.asarray(data["covariance"], dtype=np.float64),
+            covariance=np.asarray(data["covariance"], float),
             parent_frame=str(data["parent_frame"]),
             child_frame=str(data["child_frame"]),
             camera=None if lens is None else Camera.from_dict(lens),
@@ -214,7 +214,7 @@ class Calibration(FramedPose):
             error_terms=tuple(ErrorTerm(**row) for row in data.get("error_terms", [])),
             checks=checks_of(data.get("checks", {})),
             joints=tuple(JointOffset(**row) for row in data.get("joints", [])),
-            joint_covariance=np.array(data.get("joint_covariance", []), np.float64),
+            joint_covariance=np.array(data.get("joint_covariance", []), float),
             verdict=str(data.get("verdict", "")),
             source=data.get("source", {}),
             created=str(data.get("created", "")),

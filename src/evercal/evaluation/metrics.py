@@ -152,7 +152,7 @@ def share_inside(squared: ArrayLike) -> float:
 
     NaN entries are ignored; the result is NaN without any number.
     """
-    values = np.asarray(squared, dtype=np.float64)
+    values = np.asarray(squared, float)
     values = values[~np.isnan(values)]
     if not len(values):
         return math.nan
@@ -164,7 +164,7 @@ def recall_area(translation_m: ArrayLike, within_m: float = 0.2) -> float:
 
     It separates methods that have few frames below any single threshold.
     """
-    errors = np.asarray(translation_m, dtype=np.float64)
+    errors = np.asarray(translation_m, float)
     return 100 * float(np.clip(1 - errors / within_m, 0, 1).mean())
 
 
@@ -174,7 +174,7 @@ def continual_scores(accuracies: ArrayLike) -> ContinualScores:
     Entry (i, j) of `accuracies` (N, N) is the accuracy after stage i on the scene learned in stage
     j. Entries above the diagonal are ignored.
     """
-    matrix = np.asarray(accuracies, dtype=np.float64)
+    matrix = np.asarray(accuracies, float)
     count = len(np.atleast_1d(matrix))
     if count == 0 or matrix.shape != (count, count):
         raise ValueError(

@@ -112,7 +112,7 @@ class Camera:
         distortion: tuple[float, ...] = (),
     ) -> Self:
         """Convert a 3x3 intrinsic matrix without skew."""
-        k = np.asarray(matrix, dtype=np.float64)
+        k = np.asarray(matrix, float)
         if k.shape != (3, 3):
             raise ValueError(f"an intrinsic matrix is 3x3, got {k.shape}")
         zeros = np.abs([k[0, 1], k[1, 0]])
@@ -155,7 +155,7 @@ class Camera:
 
     def changed(self, change: ArrayLike) -> "Camera":
         """The camera after a change (3 + k,) of the parameters of `slopes`."""
-        log_focal, x, y, *more = np.asarray(change, np.float64).tolist()
+        log_focal, x, y, *more = np.asarray(change, float).tolist()
         terms = np.array(self.coefficients)
         terms[: len(more)] += more
         count = max(4, len(more), len(self.distortion))
@@ -220,7 +220,7 @@ class Camera:
 
         NaN for points behind the camera or beyond the range of the distortion (`widest`).
         """
-        points = np.asarray(points_camera, dtype=np.float64)
+        points = np.asarray(points_camera, float)
         if points.shape[-1:] != (3,):
             raise ValueError(f"points are (..., 3), got {points.shape}")
         # One array for each coordinate: sums along pairs take several times as long.
@@ -242,7 +242,7 @@ class Camera:
 
     def unproject(self, pixels: ArrayLike) -> Array:
         """Pixels (..., 2) to rays (..., 3) with z = 1; NaN outside the range of the distortion."""
-        pixels = np.asarray(pixels, dtype=np.float64)
+        pixels = np.asarray(pixels, float)
         if pixels.shape[-1:] != (2,):
             raise ValueError(f"pixels are (..., 2), got {pixels.shape}")
         plane = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
@@ -258,7 +258,7 @@ class Camera:
         focal lengths, the principal point in pixels, and the first distortion coefficients in
         OpenCV's order, at most five.
         """
-        plane = np.asarray(plane, dtype=np.float64)
+        plane = np.asarray(plane, float)
         x = plane[..., 0]
         y = plane[..., 1]
         (u, v), (a, b, d) = self._distorted(x, y)

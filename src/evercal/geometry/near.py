@@ -17,7 +17,7 @@ def near_training(train_poses: SE3, test_poses: SE3) -> BoolArray:
     Poses (n,) and (m,) give (m,) bool. The bounds are those of accuracy, so that the share of such
     frames is what the best lookup of a training frame could reach without any geometry.
     """
-    near = np.zeros(len(test_poses), dtype=np.bool_)
+    near = np.zeros(len(test_poses), np.bool_)
     for i, pose in enumerate(test_poses):
         metres, radians = pose_distance(pose, train_poses)
         near[i] = ((metres < COARSE[0]) & (radians < COARSE[1])).any()

@@ -36,8 +36,8 @@ class SE3:
     """(..., 3) metres."""
 
     def __post_init__(self) -> None:
-        quaternion = np.array(self.rotation_wxyz, dtype=np.float64)
-        translation = np.array(self.translation_m, dtype=np.float64)
+        quaternion = np.array(self.rotation_wxyz, float)
+        translation = np.array(self.translation_m, float)
         batch = quaternion.shape[:-1]
         if quaternion.shape[-1:] != (4,) or translation.shape != (*batch, 3):
             raise ValueError(
@@ -68,7 +68,7 @@ class SE3:
     def from_translation(cls, translation_m: ArrayLike) -> Self:
         """Create poses without rotation from (..., 3) translations, metres."""
         pose = cls.identity(np.shape(translation_m)[:-1])
-        return cls(pose.rotation_wxyz, np.asarray(translation_m, dtype=np.float64))
+        return cls(pose.rotation_wxyz, np.asarray(translation_m, float))
 
     @classmethod
     def of(
@@ -79,7 +79,7 @@ class SE3:
         Quaternions get w >= 0 if they are `canonical`; otherwise they keep their sign.
         """
         quaternion = rotation.as_quat(canonical=canonical, scalar_first=True)
-        return cls(quaternion, np.asarray(translation_m, dtype=np.float64))
+        return cls(quaternion, np.asarray(translation_m, float))
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike, tolerance: float = 1e-3) -> Self:
@@ -88,7 +88,7 @@ class SE3:
         Shapes are (..., 4, 4) or (..., 3, 4). The nearest rotation is used; `tolerance` is the
         largest entry of `R^T R - I` that counts as rounding.
         """
-        matrix = np.asarray(matrix, dtype=np.float64)
+        matrix = np.asarray(matrix, float)
         if matrix.ndim < 2 or matrix.shape[-2:] not in ((4, 4), (3, 4)):
             raise ValueError(
                 f"a pose matrix is (..., 4, 4) or (..., 3, 4), got {matrix.shape}"
@@ -118,7 +118,7 @@ class SE3:
     @classmethod
     def exp(cls, tangent: ArrayLike) -> Self:
         """Exponential map of tangents (..., 6) = (v, w): v in metres, w in radians."""
-        tangent = np.asarray(tangent, dtype=np.float64)
+        tangent = np.asarray(tangent, float)
         if tangent.shape[-1:] != (6,):
             raise ValueError(f"a tangent is (..., 6) = (v, w), got {tangent.shape}")
         velocity = tangent[..., :3]
@@ -232,7 +232,7 @@ class SE3:
 
     def apply(self, points: ArrayLike) -> Array:
         """Transform points (..., 3) to the parent frame; leading axes broadcast."""
-        points = np.asarray(points, dtype=np.float64)
+        points = np.asarray(points, float)
         if points.shape[-1:] != (3,):
             raise ValueError(f"points are (..., 3), got {points.shape}")
         if not self.shape:
@@ -313,7 +313,7 @@ def length_mm_deg(deviation: Array) -> tuple[float, float]:
 
 def cross_matrix(v: ArrayLike) -> Array:
     """(..., 3, 3) matrices of the cross product with vectors (..., 3)."""
-    v = np.asarray(v, dtype=np.float64)
+    v = np.asarray(v, float)
     matrix = np.zeros((*v.shape, 3))
     matrix[..., 0, 1] = -v[..., 2]
     matrix[..., 0, 2] = v[..., 1]

@@ -24,7 +24,7 @@ class UncertainPose:
     """(6, 6) of translation in the parent frame (m) and rotation about child axes (rad)."""
 
     def __post_init__(self) -> None:
-        covariance = np.asarray(self.covariance, dtype=np.float64)
+        covariance = np.asarray(self.covariance, float)
         if self.pose.shape or covariance.shape != (6, 6):
             raise ValueError(
                 f"an uncertain pose is one SE3 with a covariance (6, 6), got {self.pose.shape} and"
@@ -106,7 +106,7 @@ class UncertainPose:
 
 def axis_deviation(covariance: ArrayLike) -> tuple[float, float]:
     """Standard deviation per axis, millimetres and degrees: root mean squares of three axes."""
-    variance = np.diag(np.asarray(covariance, dtype=np.float64))
+    variance = np.diag(np.asarray(covariance, float))
     metres = np.sqrt(variance[:3].mean())
     radians = np.sqrt(variance[3:].mean())
     return 1000 * float(metres), float(np.rad2deg(radians))
@@ -116,4 +116,4 @@ def in_parent_axes(rotation: Array, covariance: Array) -> Array:
     """Covariance (6, 6) with its translation part rotated from child axes to the parent's."""
     slope = np.eye(6)
     slope[:3, :3] = rotation
-    return np.asarray(slope @ covariance @ slope.T, np.float64)
+    return np.asarray(slope @ covariance @ slope.T, float)

@@ -287,7 +287,7 @@ class _Search:
         matched, correlation = align_patches(
             patches, image, start, affines, step.iterations
         )
-        matched = from_level(matched.astype(np.float64), level)
+        matched = from_level(matched.astype(float), level)
         good = correlation > options.min_correlation
         good &= np.linalg.norm(matched - pixels, axis=1) < step.reach_px
         landmarks = landmarks[good]

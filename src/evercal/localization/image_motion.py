@@ -53,7 +53,7 @@ def followed(
     if count < LEAST_LANDMARKS:
         return None
     equal = np.tile(np.eye(2)[..., None], count)
-    observed = Observed(moved[found].astype(np.float64), points[ahead][found], equal)
+    observed = Observed(moved[found].astype(float), points[ahead][found], equal)
     start = predicted.rotation_matrix(), predicted.translation_m
     minimum = minimise(observed, camera, start, _ITERATIONS)
     return minimum.pose(np.zeros((6, 6))).pose

@@ -96,7 +96,7 @@ class LoadedKeyframe:
         features = encoder.encode(grey, contents.short_side).reshape(-1, encoder.width)
         small = camera.short_side_resized(contents.short_side)
         rays = small.pinhole.unproject(ideal_cell_pixels(small, encoder.stride))
-        depth = 1 / keyframes.inverse_depth[number].astype(np.float64)
+        depth = 1 / keyframes.inverse_depth[number].astype(float)
         points = rays * depth[:, None]
         # Corners of a strongly distorted image have no rays.
         valid = np.flatnonzero(np.isfinite(points).all(1))

@@ -218,7 +218,7 @@ def cell_pixels(camera: Camera, stride: int, turns: int) -> Array:
     Cells are in the order of the turned image, pixels in the axes of the upright one.
     """
     if not turns:
-        return ideal_cell_pixels(camera, stride).astype(np.float64)
+        return ideal_cell_pixels(camera, stride).astype(float)
     right = camera.width - 1
     bottom = camera.height - 1
     rows = camera.height

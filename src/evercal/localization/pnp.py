@@ -87,8 +87,8 @@ def solve_pnp(
     )
     if not solved or inliers is None or len(inliers) < MIN_INLIERS:
         return None
-    rotation = np.asarray(cv2.Rodrigues(turn)[0], np.float64).T
-    start = rotation, -rotation @ np.asarray(shift, np.float64).ravel()
+    rotation = np.asarray(cv2.Rodrigues(turn)[0], float).T
+    start = rotation, -rotation @ np.asarray(shift, float).ravel()
     return _refined(pixels, points_m, camera.pinhole, start, options.threshold_px)
 
 

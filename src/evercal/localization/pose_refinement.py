@@ -230,7 +230,7 @@ def cells_of(pixels: Array, camera: Camera) -> Array:
     """(n, cells) 1 where a pixel (n, 2) lies in a cell of the image."""
     side = min(camera.width, camera.height) / SHARED_CELLS
     cell = (pixels // side).astype(np.int64) @ [1, 1000]
-    return (cell[:, None] == np.unique(cell)).astype(np.float64)
+    return (cell[:, None] == np.unique(cell)).astype(float)
 
 
 def linearise(

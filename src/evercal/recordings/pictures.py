@@ -49,7 +49,7 @@ def look_at(frames: Sequence[Frame]) -> Pictures:
     tiny = [
         cv2.resize(image, (40, 30), interpolation=cv2.INTER_AREA) for image in images
     ]
-    steps = np.diff(np.array(tiny, np.float64), axis=0)
+    steps = np.diff(np.array(tiny, float), axis=0)
     change = np.abs(steps).mean((1, 2, 3))
     if len(images) > 1 and np.median(change) < _SAME:
         return Pictures(

@@ -252,7 +252,7 @@ def residual_chart(calibration: Calibration) -> Chart | None:
     """Bars of the residuals of all images, cut at twice the largest used one; None without any."""
     images = calibration.images
     residuals = [[image.residual_mm, image.residual_deg] for image in images]
-    rows = np.array(residuals, np.float64).reshape(-1, 2)
+    rows = np.array(residuals, float).reshape(-1, 2)
     if not np.isfinite(rows).any():
         return None
     used = np.array([image.used for image in images])

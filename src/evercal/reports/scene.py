@@ -154,7 +154,7 @@ class Landmarks3D:
             return np.zeros((0, 3), np.uint8)
         values = np.log(np.maximum(self.sigma_mm, 1e-6))
         if by == "height":
-            values = np.asarray(self.points_m[:, 2], np.float64)
+            values = np.asarray(self.points_m[:, 2], float)
         low, high = np.percentile(values, [2, 98]).tolist()
         return colour_map(values, (low, high))
 
@@ -225,7 +225,7 @@ class Surroundings:
             return cls()
         marks = Landmarks3D.of(scene, _DRAWN_POINTS)
         views = tuple(view.frustum for view in keyframe_views(scene))
-        return cls(np.asarray(marks.points_m, np.float64), marks.grey, views)
+        return cls(np.asarray(marks.points_m, float), marks.grey, views)
 
     def bounds(self, others: Array) -> Array:
         """(2, 3) corners of a box around the keyframes, other points, and the landmarks near by."""

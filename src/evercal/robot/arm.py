@@ -47,7 +47,7 @@ class Arm:
 
     def rotates(self) -> BoolArray:
         """(k,) whether a value is an angle."""
-        rotates = np.zeros(len(self.joints), dtype=bool)
+        rotates = np.zeros(len(self.joints), bool)
         for joint in self.chain:
             rotates[joint.value] |= joint.rotates
         return rotates
@@ -59,7 +59,7 @@ class Arm:
         camera.
         """
         values = [joint.value for joint in self.chain]
-        free = np.ones(len(self.joints), dtype=bool)
+        free = np.ones(len(self.joints), bool)
         for end in (*values[:1], *values[-1:]):
             free[end] = values.count(end) > 1
         return free

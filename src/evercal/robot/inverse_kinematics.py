@@ -89,7 +89,7 @@ def _solved(arm: Arm, poses: SE3) -> tuple[Array, BoolArray]:
     middle = some[distances.sum(0).argmin()]
     branches = _postures(arm, poses[[middle] * _STARTS])
     if not len(branches):
-        return branches, np.zeros(len(poses), dtype=bool)
+        return branches, np.zeros(len(poses), bool)
     found = _iterate(
         arm,
         poses[np.tile(some, len(branches))],

@@ -189,7 +189,7 @@ def _image_from_dict(data: Mapping[str, Any]) -> BoardImage:
     pose = data["camera_from_board"]
     if pose is None:
         return BoardImage(name, reason=str(data.get("reason", "no board")))
-    covariance = np.asarray(data["covariance"], dtype=np.float64)
+    covariance = np.asarray(data["covariance"], float)
     if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
         raise ValueError(
             f"'covariance' of {name} must be finite and 6x6, got {covariance.shape}"

@@ -45,8 +45,8 @@ class BoardView:
     """(k, 2) x, y."""
 
     def __post_init__(self) -> None:
-        points = np.asarray(self.points_m, dtype=np.float64)
-        pixels = np.asarray(self.pixels, dtype=np.float64)
+        points = np.asarray(self.points_m, float)
+        pixels = np.asarray(self.pixels, float)
         if (
             points.shape[1:] != (3,)
             or pixels.shape != (len(points), 2)
@@ -265,7 +265,7 @@ def _refined(
         rotvec, translation = cv2.solvePnPRefineLM(
             points, pixels, camera.matrix(), distortion, rotvec, translation
         )
-        return np.asarray(rotvec, np.float64), np.asarray(translation, np.float64)
+        return np.asarray(rotvec, float), np.asarray(translation, float)
     for _ in range(_MAX_ITERATIONS):
         projected, by_pose, _ = _projected(points, camera, rotvec, translation)
         step = np.linalg.lstsq(by_pose, (pixels - projected).ravel(), rcond=None)[0]
@@ -288,12 +288,12 @@ def _projected(
         pixels, slopes = cv2.fisheye.projectPoints(
             points[:, None].copy(), rotvec, translation, matrix, distortion
         )
-        by_camera, by_pose, _ = np.split(np.asarray(slopes, np.float64), [8, 14], 1)
+        by_camera, by_pose, _ = np.split(np.asarray(slopes, float), [8, 14], 1)
     else:
         pixels, slopes, *_ = cv2.projectPoints(
             points, rotvec, translation, matrix, distortion
         )
-        by_pose, by_camera = np.split(np.asarray(slopes, np.float64), [6], 1)
+        by_pose, by_camera = np.split(np.asarray(slopes, float), [6], 1)
     pixels = np.reshape(pixels, (-1, 2)).astype(float)
     return pixels, by_pose, by_camera[:, : 4 + len(distortion)]
 
@@ -353,7 +353,7 @@ def strays(
     stray = []
     for view, fit in zip(views, poses, strict=True):
         pose = fit
-        keep = np.ones(fit.corners, dtype=bool)
+        keep = np.ones(fit.corners, bool)
         apart, sigma = _apart(view, pose)
         while apart.max() > _STRAY_SIGMAS * max(sigma, usual):
             keep[np.flatnonzero(keep)[apart.argmax()]] = False

@@ -129,7 +129,7 @@ def _settled(
 
 def _find_chessboard(grey: Image, board: Board) -> Detection:
     size = (board.columns, board.rows)
-    y, x = np.indices(size[::-1], dtype=np.float64)
+    y, x = np.indices(size[::-1], dtype=float)
     squares = np.stack([x, y, np.zeros_like(x)], -1)
     points = board.size_m * squares.reshape(-1, 3)
     for pixels in _chessboard_candidates(grey, size):
@@ -169,7 +169,7 @@ def _chessboard_candidates(
         detected, pixels = find(image, size, flags=flags)
         if detected:
             yield resize_pixels(
-                pixels.reshape(-1, 2).astype(np.float64),
+                pixels.reshape(-1, 2).astype(float),
                 1 / scale,
             )
 

@@ -104,7 +104,7 @@ def _in_windows(
         refined[rows] = corners[:, 0]
     lost = np.linalg.norm(refined - start, axis=1) > half
     refined[lost] = start[lost]
-    return refined.astype(np.float64)
+    return refined.astype(float)
 
 
 def _steps(
@@ -199,7 +199,7 @@ def _edges(
         None,
         cv2.BORDER_REPLICATE,
     )
-    values = np.asarray(values, dtype=np.float64).reshape(grid.shape[:3])
+    values = np.asarray(values, float).reshape(grid.shape[:3])
     slope = np.gradient(values, axis=2)
     if outwards:
         slope = np.maximum(slope, 0.0)

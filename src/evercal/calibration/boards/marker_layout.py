@@ -17,7 +17,7 @@ from evercal.typing import Array, BoolArray, IntArray
 Plane: TypeAlias = NDArray[np.complexfloating]
 """Vectors x + i y."""
 
-SQUARE: Plane = np.array([-1 - 1j, 1 - 1j, 1 + 1j, -1 + 1j], dtype=np.complex128) / 2
+SQUARE: Plane = np.array([-1 - 1j, 1 - 1j, 1 + 1j, -1 + 1j], np.complex128) / 2
 """Corners of a marker in OpenCV's order and axes, sides."""
 _MIN_STEPS = 8
 """Minimum number of steps between markers for a judgement on the layout."""
@@ -102,7 +102,7 @@ class MarkerLayout(NamedTuple):
         start = self.cells(markers.start)
         steps = self.cells(markers.end) - start
         if len(steps) == 0:
-            return np.zeros(0, dtype=bool), 0.0
+            return np.zeros(0, bool), 0.0
         lengths = np.abs(steps)
         measured = np.abs(markers.steps)
         side = float(np.median(lengths / measured))

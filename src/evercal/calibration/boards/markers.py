@@ -83,8 +83,8 @@ def find_markers(grey: Image, board: Board) -> Markers:
         squares = max(squares, detected, key=len)
         if _is_complete(detected, board):
             break
-    ids = np.array(list(squares), dtype=np.int64)
-    corners = np.reshape(list(squares.values()), (-1, 4, 2)).astype(np.float64)
+    ids = np.array(list(squares), np.int64)
+    corners = np.reshape(list(squares.values()), (-1, 4, 2)).astype(float)
     if squares:
         corners = squares_by_their_sides(grey, corners)
     return Markers(
@@ -192,7 +192,7 @@ def find_charuco(grey: Image, board: Board) -> Detection:
     dictionary = dictionary_of(board)
     printed = cv2.aruco.CharucoBoard(size, board.size_m, board.marker_m, dictionary)
     printed.setLegacyPattern(layout.parity == 0)
-    ids = np.zeros(0, dtype=np.int64)
+    ids = np.zeros(0, np.int64)
     pixels = np.zeros((0, 2))
     if len(markers.ids):
         squares = list(markers.corners[:, None].astype(np.float32))
@@ -200,10 +200,10 @@ def find_charuco(grey: Image, board: Board) -> Detection:
         detector = cv2.aruco.CharucoDetector(printed)
         detected = detector.detectBoard(grey, None, None, squares, numbers)
         if detected[0] is not None and detected[1] is not None:
-            pixels = np.reshape(detected[0], (-1, 2)).astype(np.float64)
+            pixels = np.reshape(detected[0], (-1, 2)).astype(float)
             ids = np.ravel(detected[1]).astype(np.int64)
     if len(ids) >= _MIN_CORNERS:
-        chessboard = np.asarray(printed.getChessboardCorners(), dtype=np.float64)
+        chessboard = np.asarray(printed.getChessboardCorners(), float)
         points = chessboard[ids]
         extents = np.linalg.svd(points - points.mean(0), compute_uv=False)
         if extents[1] > 0.5 * board.size_m:

@@ -67,7 +67,7 @@ def board_image(board: Board, unit_px: int) -> Image:
         _require_marker(board, number)
         side_px = _cells(board) * unit_px
         drawn = cv2.aruco.generateImageMarker(dictionary, number, side_px)
-    return np.asarray(drawn, dtype=np.uint8)
+    return np.asarray(drawn, np.uint8)
 
 
 def _require_marker(board: Board, number: int) -> None:

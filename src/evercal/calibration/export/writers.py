@@ -281,7 +281,7 @@ def tum(export: Export) -> str:
     """Write lines of stamp, translation in metres, quaternion x y z w: base_from_camera."""
     rows = pose_numbers(_image_poses(export)[1])
     robot = export.robot_poses
-    stamps = np.arange(len(rows), dtype=np.float64)
+    stamps = np.arange(len(rows), dtype=float)
     if not export.in_hand:
         stamps = stamps[:1]
         rows = rows[:1]

@@ -112,8 +112,8 @@ def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
             f" {files.camera}; give one row per image, or name the images in a column 'image'"
         )
     shown = np.flatnonzero(camera.measured)
-    images = np.array([i for i in shown if rows[i] is not None], dtype=np.int64)
-    robots = np.array([rows[i] for i in images], dtype=np.int64)
+    images = np.array([i for i in shown if rows[i] is not None], np.int64)
+    robots = np.array([rows[i] for i in images], np.int64)
     if len(images) == 0:
         raise InputError(f"{files.camera}: no image has both a board and a robot pose")
     names = camera.names or robot.row_names()
@@ -206,7 +206,7 @@ def _read(
         table.names,
         stamps,
         poses,
-        np.ones(len(poses), dtype=bool),
+        np.ones(len(poses), bool),
         numbers,
     )
 

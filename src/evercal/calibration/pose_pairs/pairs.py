@@ -112,7 +112,7 @@ class PosePairs:
             *_canonical(camera).T,
         ]
         order = np.lexsort(keys[::-1])
-        first = np.empty(len(self), dtype=np.int64)
+        first = np.empty(len(self), np.int64)
         first[order] = order[self[order].repeats(scale_known)]
         return order[first[order] == order], first
 

@@ -109,7 +109,7 @@ def _pairs_at(
     robot: PoseTrack, camera: CameraTrack, offset: float
 ) -> tuple[PosePairs, CameraTrack]:
     """Return the pairs within the robot's track, with velocities."""
-    times = np.asarray(camera.stamps_s + offset, dtype=np.float64)
+    times = np.asarray(camera.stamps_s + offset, float)
     poses, inside = robot.at(times)
     begin = robot.stamps_s[0]
     end = robot.stamps_s[-1]
@@ -144,7 +144,7 @@ def _coarse_offset(
 ) -> float:
     """Return the offset on a grid at which robot and camera rotate by the same angles."""
     order = np.argsort(camera.stamps_s)
-    stamps = np.asarray(camera.stamps_s[order], dtype=np.float64)
+    stamps = np.asarray(camera.stamps_s[order], float)
     angles = steps_rad(camera.camera_from_board[order])
     best = (np.inf, 0.0)
     for offset in np.arange(

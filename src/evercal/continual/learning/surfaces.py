@@ -48,7 +48,7 @@ def frame_depths(
     sources = []
     for i in numbers:
         inverse, near = prepared.swept(i, SOURCE_VIEWS)
-        swept.append(1 / inverse.astype(np.float64))
+        swept.append(1 / inverse.astype(float))
         sources.append(near)
     return [_agreed(prepared, i, swept, sources[i]) for i in numbers]
 

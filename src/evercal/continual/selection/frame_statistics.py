@@ -101,7 +101,7 @@ class FrameStatistics:
             reliable.append(points[error < RELIABLE_PX].double().cpu().numpy())
         points = np.concatenate(reliable)
         if not len(points):
-            return [np.zeros(0, dtype=np.int64)] * len(reliable)
+            return [np.zeros(0, np.int64)] * len(reliable)
         rng = self.rng()
         sample = points[rng.permutation(len(points))[:PART_POINTS]]
         start = sample[rng.permutation(len(sample))[:PARTS]]

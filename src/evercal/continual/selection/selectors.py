@@ -42,7 +42,7 @@ def select_herding(features: Array, capacity: int) -> IntArray:
     if not len(unit):
         return _sorted([])
     mean = unit.mean(0)
-    free = np.ones(len(unit), dtype=bool)
+    free = np.ones(len(unit), bool)
     total = np.zeros(unit.shape[1])
     selected = []
     for count in range(1, min(capacity, len(unit)) + 1):
@@ -61,7 +61,7 @@ def leverage_scores(features: Array, rank: int) -> Array:
     The scores sum to the rank. FedCBDR prints the full left factor, whose rows all have norm 1; the
     thin one is used here.
     """
-    double = np.asarray(features, np.float64)
+    double = np.asarray(features, float)
     left, values, _ = np.linalg.svd(double, full_matrices=False)
     floor = values.max(initial=0) * 1e-9
     used = min(rank, np.count_nonzero(values > floor))
@@ -142,11 +142,11 @@ def select_gradients(gradients: Array, capacity: int, rng: Generator) -> IntArra
 
 
 def _sorted(frames: list[int]) -> IntArray:
-    return np.sort(np.array(frames, dtype=np.int64))
+    return np.sort(np.array(frames, np.int64))
 
 
 def _unit(rows: Array) -> Array:
-    rows = np.asarray(rows, dtype=np.float64)
+    rows = np.asarray(rows, float)
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
     return rows / np.maximum(lengths, 1e-12)
 

@@ -307,7 +307,7 @@ def _refuse_unknown(data: Fields) -> None:
             continue
         if isinstance(value, Mapping):
             value = value.get("data")
-        array = np.array(value, dtype=object)
+        array = np.array(value, object)
         cells = np.ravel(array).tolist()
         if not all(map(is_number, cells)) or not any(map(float, cells)):
             continue
@@ -370,7 +370,7 @@ def numbers_of(value: Any, name: str, count: int | None = None) -> list[float]:
         if not isinstance(value, list) or bool in map(type, value):
             raise TypeError
         # YAML 1.1 reads 1e-05, as written by ROS, as a word.
-        array = np.array(value, dtype=np.float64)
+        array = np.array(value, float)
         numbers = array.ravel().tolist()
     except (TypeError, ValueError):
         raise ValueError(f"'{name}' is a list of numbers, got {value!r}") from None

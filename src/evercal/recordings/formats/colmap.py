@@ -139,7 +139,7 @@ def _model(folder: Path) -> dict[str, tuple[Camera, SE3]]:
     with named_errors(file, "COLMAP model"):
         for key, model, width, height, *numbers in read(file):
             size = (int(width), int(height))
-            cameras[int(key)] = _camera(model, size, np.array(numbers, np.float64))
+            cameras[int(key)] = _camera(model, size, np.array(numbers, float))
     images = {}
     file = folder / f"images{end}"
     with named_errors(file, "COLMAP model"):
@@ -147,7 +147,7 @@ def _model(folder: Path) -> dict[str, tuple[Camera, SE3]]:
             name = path_inside(name, "the name of an image")
             if name in images or int(key) not in cameras:
                 raise ValueError(f"{name} comes twice, or camera {key} has no entry")
-            numbers = np.array(pose, np.float64)
+            numbers = np.array(pose, float)
             camera_from_world = SE3(numbers[:4], numbers[4:])
             images[name] = (cameras[int(key)], camera_from_world.inverse())
     return images

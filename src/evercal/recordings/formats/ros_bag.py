@@ -266,7 +266,7 @@ def image_of(message: Any) -> Image:
     width = int(message.width)
     step = int(message.step)
     line = width * channels * size
-    data = np.asarray(message.data, dtype=np.uint8).reshape(-1)
+    data = np.asarray(message.data, np.uint8).reshape(-1)
     if step < line or data.size < height * step or not line * height:
         raise ValueError(
             f"{width}x{height} {message.encoding}, step {step}, but {data.size} bytes"
@@ -295,7 +295,7 @@ def compressed_image_of(message: Any) -> Image:
     reason = unsupported(encoding)
     if reason is not None:
         raise ValueError(f"format {message.format!r}: {reason}")
-    image = decode_image(np.asarray(message.data, dtype=np.uint8))
+    image = decode_image(np.asarray(message.data, np.uint8))
     if image is None:
         what = f"format {message.format!r} is not supported or broken"
         raise ValueError(f"{what}; let 'image_transport republish' write jpeg or png")

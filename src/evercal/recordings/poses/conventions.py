@@ -187,7 +187,7 @@ def poses_from_numbers(
     the pose, or the first with `camera_from` (camera_from_board); only `:opengl` depends on it.
     ValueError: numbers are no pose; the message names the first of them.
     """
-    numbers = np.asarray(numbers, dtype=np.float64)
+    numbers = np.asarray(numbers, float)
     width = numbers.shape[-1] if numbers.ndim else 1
     if width not in convention.counts:
         raise ValueError(

@@ -111,7 +111,7 @@ def read_joints(path: Path) -> LabelledRows:
     data = read_json(path, "file of joint angles", f"give {_JSON}")
     with library_errors(f"{path}: give {_JSON}"):
         columns = tuple(map(str, data["joint_names"]))
-        values = np.array(data["positions"], dtype=np.float64)
+        values = np.array(data["positions"], float)
         lists = {key: value for key, value in data.items() if isinstance(value, list)}
         names, stamps, _ = row_labels(
             [*lists], [*lists.values()], len(values), plural=True

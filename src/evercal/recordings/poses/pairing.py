@@ -220,7 +220,7 @@ def _image_times(
                 f"{image}: stamps.csv has no row for it; add one for every image"
             )
         times.append(time)
-    return np.array(times, dtype=np.float64)
+    return np.array(times, float)
 
 
 def counted(number: int, what: str) -> str:

@@ -205,7 +205,7 @@ def named_numbers(words: Sequence[str], rows: Cells, given: Given) -> PoseTable:
         if not position and not convention.is_matrix:
             position = others[:3]
         columns = [i for i in others if i not in position]
-    header = np.array(words, dtype=object)
+    header = np.array(words, object)
     convention = _in_units(convention, header[position].tolist(), "m", "mm")
     if convention.has_angles:
         convention = _in_units(convention, header[columns].tolist(), "rad", "deg")
@@ -311,7 +311,7 @@ def groups_of(words: Sequence[str]) -> _Groups:
 
 
 def _matched(names: Sequence[str], words: Sequence[str]) -> _Groups:
-    header = np.array(words, dtype=object)
+    header = np.array(words, object)
     groups: _Groups = {}
     used: set[int] = set()
     for key, group in HEADERS.items():
@@ -355,7 +355,7 @@ def _defined(groups: _Groups, words: Sequence[str]) -> str:
         raise ConventionError(problem, " or ".join(definite.values()))
     if unclear and not definite:
         key = unclear[0]
-        columns = ", ".join(np.array(words, dtype=object)[groups[key]])
+        columns = ", ".join(np.array(words, object)[groups[key]])
         problem = f"columns {columns} do not define a rotation"
         raise ConventionError(problem, HEADERS[key].ask)
     raise ConventionError(

@@ -26,7 +26,7 @@ class PoseTrack:
     """(n,) poses at these times."""
 
     def __post_init__(self) -> None:
-        stamps = np.asarray(self.stamps_s, dtype=np.float64)
+        stamps = np.asarray(self.stamps_s, float)
         shape = stamps.shape
         if len(shape) != 1 or not stamps.size or shape != self.poses.shape:
             raise ValueError(
@@ -46,11 +46,11 @@ class PoseTrack:
             a gap of more than `MAX_GAP_S` seconds over which the frame moved.
         """
         times = self.stamps_s
-        stamps = np.asarray(stamps_s, dtype=np.float64)
+        stamps = np.asarray(stamps_s, float)
         inside = np.clip(stamps, times[0], times[-1])
         valid = inside == stamps
         if len(times) == 1:
-            return self.poses[np.zeros(len(stamps), dtype=int)], valid
+            return self.poses[np.zeros(len(stamps), int)], valid
         after, close = times_around(times, inside)
         first = self.poses[after - 1]
         second = self.poses[after]

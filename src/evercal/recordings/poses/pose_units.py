@@ -35,7 +35,7 @@ def checked_poses(
 
 def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
     """Refuse numbers (n, k) that look like another unit than the convention only implies."""
-    numbers = np.asarray(numbers, dtype=np.float64)
+    numbers = np.asarray(numbers, float)
     if not convention.has("m", "mm"):
         positions = numbers[..., :3]
         if convention.is_matrix:

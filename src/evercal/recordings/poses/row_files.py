@@ -108,7 +108,7 @@ def table_cells(lines: Sequence[str]) -> Cells:
     _require_few_cells(columns, len(lines))
     rows = _split(lines, separator)
     if not rows:
-        return np.empty((0, 0), dtype=object)
+        return np.empty((0, 0), object)
     cells = text_cells([map(str.strip, row) for row in rows])
     if separator == ",":
         return cells
@@ -172,7 +172,7 @@ def _require_few_cells(columns: int, rows: int) -> None:
 
 def text_cells(rows: Iterable[Iterable[str]]) -> Cells:
     """(n, k) cells of rows."""
-    cells = np.array([*map(list, rows)], dtype=object)
+    cells = np.array([*map(list, rows)], object)
     lengths = [*map(len, cells.flat)]
     longest = max(lengths, default=0)
     most = bounds().cell_characters
@@ -195,7 +195,7 @@ def cell_numbers(cells: Cells, words: Sequence[str] = ()) -> Array:
         if "[" in cell:
             problem += "; write all poses with brackets, or none"
         raise ValueError(f"{where}: {problem}")
-    return cells.astype(np.float64)
+    return cells.astype(float)
 
 
 def name_and_unit(cell: str) -> tuple[str, str | None]:
@@ -291,7 +291,7 @@ def _require_whole(word: str, column: Sequence[object], count: int) -> None:
 def number_array(values: object, what: str) -> Array:
     """Convert nested lists to an array; ValueError if they are ragged or hold other things."""
     try:
-        return np.array(values, dtype=np.float64)
+        return np.array(values, float)
     except (TypeError, ValueError):
         raise ValueError(
             f"{what} is made of numbers and has the same shape everywhere"
@@ -346,7 +346,7 @@ def times_in_names(names: Sequence[str]) -> Array | None:
     stems = [*map(without_ending, names)]
     if not stems or not all(map(_TIME.fullmatch, stems)):
         return None
-    times = in_unit(np.array(stems, dtype=np.float64))
+    times = in_unit(np.array(stems, float))
     since_1970 = (times > _EARLIEST_S) & (times < _LATEST_S)
     if since_1970.all() or "." in "".join(stems):
         return times

@@ -135,7 +135,7 @@ class _TfTree:
                 f" {chain_a[-1]!r} and {chain_b[-1]!r}; record the transform that joins them"
             )
         shared = {*chain_a}.intersection(chain_b)
-        valid = np.ones(len(stamps_s), dtype=bool)
+        valid = np.ones(len(stamps_s), bool)
         sides = []
         for chain in (chain_a, chain_b):
             ancestor_from_frame = SE3.identity((len(stamps_s),))
@@ -229,7 +229,7 @@ def poses_at_images(
 ) -> ImagePoses:
     """Interpolate the pose of the gripper at n images in `camera_frame`, at `stamps_ns` (n,)."""
     zero = int(stamps_ns[0])
-    stamps = (stamps_ns - zero).astype(np.float64) * 1e-9
+    stamps = (stamps_ns - zero).astype(float) * 1e-9
     if options.urdf is not None:
         return _from_joints(bag, stamps, zero, RobotModel(options.urdf), options)
     tree, times = _tf(bag, zero, options.pose_topic)
@@ -326,7 +326,7 @@ def _from_joints(
     bag.require_topic(options.pose_topic, topics, "joint states")
     tracks = _joint_tracks(bag, topics, zero_ns)
     values = np.zeros((len(stamps), len(tracks)))
-    valid = np.ones(len(stamps), dtype=bool)
+    valid = np.ones(len(stamps), bool)
     times = np.empty(0)
     needed = model.arm(base, gripper).joints
     for column, (name, track) in enumerate(tracks.items()):
