@@ -15,7 +15,7 @@ from scipy import stats
 from evercal.calibration.framed_pose import FramedPose
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
-from evercal.geometry import axis_deviation, length_mm_deg
+from evercal.geometry import axis_deviation, length_mm_deg, norms
 from evercal.geometry.rays import angles, fit_rays
 from evercal.robot.mount import mount_named
 from evercal.typing import Array
@@ -140,7 +140,7 @@ def compare(
     return Comparison(
         distance,
         _spread(np.rad2deg(angles(behind, ahead))),
-        _spread(1000 * np.linalg.norm(points, axis=1)),
+        _spread(1000 * norms(points)),
         *length_mm_deg(error),
         float(np.rad2deg(np.median(angles(own, other)))),
         *axis_deviation(covariance),

@@ -33,7 +33,7 @@ from evercal.calibration.located import (
 from evercal.calibration.verdict import verdict
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, deviations
+from evercal.geometry import SE3, Camera, deviations, norms
 from evercal.geometry.camera import COEFFICIENTS
 from evercal.geometry.rays import fit_rays
 from evercal.localization.intrinsics import STATED, cameras_in_scenes
@@ -227,7 +227,7 @@ def _stands_still(located: Sequence[ImagePose]) -> bool:
             " with `mount`, or give images of more gripper poses"
         )
     deviation = deviations(poses_of(shown), fused.pose).reshape(-1, 2, 3)
-    metres, radians = np.median(np.linalg.norm(deviation, axis=2), axis=0)
+    metres, radians = np.median(norms(deviation), axis=0)
     return bool(metres < STILL_M and radians < STILL_RAD)
 
 

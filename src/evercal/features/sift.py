@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from evercal.classes import frozen_arrays
-from evercal.geometry import Camera
+from evercal.geometry import Camera, norms
 from evercal.typing import Array, Float32Array, Image, IntArray
 
 FEATURES = 1500
@@ -75,7 +75,7 @@ def epipolar_rays(
     rays_a = first.unproject(pixels_a)
     rays_b = second.unproject(pixels_b)
     rays = np.stack([rays_a, rays_b])
-    moved_px = np.linalg.norm(pixels_a - pixels_b, axis=1)
+    moved_px = norms(pixels_a - pixels_b)
     valid = np.isfinite(rays).all((0, 2))
     valid &= moved_px >= least_px
     if valid.sum() < MIN_INLIERS:

@@ -7,6 +7,7 @@ from evercal.geometry.se3 import SE3 as SE3
 from evercal.geometry.se3 import cross_matrix as cross_matrix
 from evercal.geometry.se3 import deviations as deviations
 from evercal.geometry.se3 import length_mm_deg as length_mm_deg
+from evercal.geometry.se3 import norms as norms
 from evercal.geometry.se3 import pose_distance as pose_distance
 from evercal.geometry.se3 import pose_distance_mm_deg as pose_distance_mm_deg
 from evercal.geometry.se3 import pose_to_dict as pose_to_dict

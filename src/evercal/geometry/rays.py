@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry.camera import Camera
+from evercal.geometry.se3 import norms
 from evercal.typing import Array
 
 MIDDLE = (0.1, 0.9)
@@ -36,7 +37,7 @@ class RayFit(NamedTuple):
 
 def angles(a: Array, b: Array) -> Array:
     """Angles (m,) between unit vectors (m, 3), radians."""
-    chord = np.linalg.norm(a - b, axis=-1)
+    chord = norms(a - b)
     return 2 * np.arcsin(chord / 2)
 
 

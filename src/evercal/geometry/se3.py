@@ -282,11 +282,11 @@ def pose_to_dict(pose: SE3 | None) -> dict[str, object] | None:
 
 def pose_distance(a: SE3, b: SE3) -> tuple[Array, Array]:
     """Metres (...) and radians (...) in [0, pi] between transforms into the same frame."""
-    metres = np.linalg.norm(a.translation_m - b.translation_m, axis=-1)
+    metres = norms(a.translation_m - b.translation_m)
     conjugate = a.rotation_wxyz * _CONJUGATE
     difference = _quaternion_product(conjugate, b.rotation_wxyz)
     # atan2 keeps full precision near 0 and pi, where arccos of the trace loses half the digits.
-    sine = np.linalg.norm(difference[..., 1:], axis=-1)
+    sine = norms(difference[..., 1:])
     cosine = np.abs(difference[..., 0])
     return np.asarray(metres), 2.0 * np.arctan2(sine, cosine)
 
@@ -309,6 +309,11 @@ def length_mm_deg(deviation: Array) -> tuple[float, float]:
     metres = np.linalg.norm(deviation[:3])
     radians = np.linalg.norm(deviation[3:])
     return 1000 * float(metres), float(np.rad2deg(radians))
+
+
+def norms(vectors: Array) -> Array:
+    """Lengths (...) of vectors (..., k)."""
+    return np.linalg.norm(vectors, axis=-1)
 
 
 def cross_matrix(v: ArrayLike) -> Array:

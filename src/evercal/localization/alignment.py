@@ -7,7 +7,7 @@ import numpy as np
 
 from evercal.classes import frozen
 from evercal.errors import InputError, require_numbers
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, norms
 from evercal.localization.intrinsics import IntrinsicsPrior
 from evercal.localization.keyframe_bank import AlignedLandmarks
 from evercal.localization.pnp import PnpOptions, solve_pnp
@@ -181,7 +181,7 @@ def _shift_by_intrinsics_px(camera: Camera, change: Array) -> float:
     pixels = np.stack(grid, -1).reshape(-1, 2)
     rays = camera.pinhole.unproject(pixels)
     _, by_intrinsics = camera.slopes(rays[:, :2])
-    shifts = np.linalg.norm(by_intrinsics @ change, axis=-1)
+    shifts = norms(by_intrinsics @ change)
     shifts = shifts[np.isfinite(shifts)]
     return float(np.sort(shifts)[-7])
 
@@ -289,7 +289,7 @@ class _Search:
         )
         matched = from_level(matched.astype(float), level)
         good = correlation > options.min_correlation
-        good &= np.linalg.norm(matched - pixels, axis=1) < step.reach_px
+        good &= norms(matched - pixels) < step.reach_px
         landmarks = landmarks[good]
         if len(landmarks) < options.min_matches:
             return None

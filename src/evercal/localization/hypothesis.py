@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from evercal.classes import frozen_arrays
-from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.geometry import SE3, Camera, UncertainPose, norms
 from evercal.localization import acceptance
 from evercal.localization.pose_refinement import Observed
 from evercal.localization.query import Candidate
@@ -25,7 +25,7 @@ class Matches(NamedTuple):
     def beside(self, camera: Camera, pose: SE3, px: float) -> "Matches":
         """Matches whose reprojection error at a pose map_from_camera is above `px`."""
         projected = camera.pinhole.project(pose.inverse().apply(self.points_m))
-        errors_px = np.linalg.norm(projected - self.pixels, axis=1)
+        errors_px = norms(projected - self.pixels)
         outliers = ~(errors_px < px)  # points behind the camera have no projection
         return Matches(self.pixels[outliers], self.points_m[outliers])
 

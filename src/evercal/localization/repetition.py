@@ -7,7 +7,7 @@ displacement, the pose displaced by it matches these landmarks as well, and othe
 import numpy as np
 from numpy.typing import NDArray
 
-from evercal.geometry import SE3
+from evercal.geometry import SE3, norms
 from evercal.geometry.normal_equations import gram
 from evercal.typing import Array, IntArray
 
@@ -43,12 +43,12 @@ def pattern_steps(points_m: Array, templates: Array, position_m: Array) -> Array
     sampled = np.linspace(0, len(points_m) - 1, count).astype(int)
     points = points_m[sampled]
     patches = templates[sampled]
-    distances = np.linalg.norm(points - position_m, axis=1)
+    distances = norms(points - position_m)
     distance = float(np.median(distances))
     correlation = gram(patches)
     first, second = np.nonzero(correlation > ALIKE * patches.shape[1])
     moves = points[second] - points[first]
-    lengths = np.linalg.norm(moves, axis=1)
+    lengths = norms(moves)
     moves = moves[lengths > LEAST_STEP * distance]
     if not len(moves):
         return np.zeros((0, 3))

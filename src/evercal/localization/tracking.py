@@ -19,7 +19,7 @@ import numpy as np
 from evercal.classes import frozen, frozen_arrays
 from evercal.errors import require_numbers
 from evercal.features.views import working_grey
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry import SE3, Camera, norms, pose_distance
 from evercal.localization.acceptance import APART_SIGMAS
 from evercal.localization.answer import answer
 from evercal.localization.estimate import PoseEstimate
@@ -293,7 +293,7 @@ class Tracker:
         if pose.inlier_ratio < LEAST_OF_RATIO * self._ratio:
             return False
         before = camera.project(start.inverse().apply(pose.points_m))
-        moved_px = np.median(np.linalg.norm(pose.pixels - before, axis=1))
+        moved_px = np.median(norms(pose.pixels - before))
         return bool(moved_px < MOST_MOVED_PX)
 
     def _small(self, image: Image) -> Image:

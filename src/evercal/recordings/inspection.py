@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from evercal.classes import frozen
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry import SE3, Camera, norms, pose_distance
 from evercal.geometry.near import near_training
 from evercal.recordings.frame import (
     MIN_GRIPPER_FRAMES,
@@ -228,7 +228,7 @@ def _motion_warnings(
 ) -> Iterator[str]:
     of_camera = owner == "camera"
     rotation_deg = _largest_turn_deg(poses)
-    reach = float(np.median(np.linalg.norm(poses.translation_m, axis=1)))
+    reach = float(np.median(norms(poses.translation_m)))
     if reach > LARGEST_REACH_M and not of_camera:
         yield (
             f"the gripper is {reach:.1f} m from the robot's base, farther than arms reach; are the"

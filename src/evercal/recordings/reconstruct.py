@@ -19,6 +19,7 @@ import numpy as np
 
 from evercal.classes import frozen
 from evercal.errors import InputError, optional_module
+from evercal.geometry import norms
 from evercal.recordings.images import write_image
 from evercal.recordings.pictures import is_blank
 from evercal.recordings.streams import StreamFrame, stream
@@ -173,7 +174,7 @@ def _motion(before: Image | None, now: Image) -> float:
     tracked = status.ravel() == 1
     if tracked.mean() < 0.3:
         return np.inf
-    lengths = np.linalg.norm((moved - corners)[tracked], axis=-1)
+    lengths = norms((moved - corners)[tracked])
     return float(np.median(lengths)) / _SMALL_PX
 
 

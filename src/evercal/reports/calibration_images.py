@@ -12,7 +12,7 @@ from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, resize_pixels
+from evercal.geometry import SE3, Camera, norms, resize_pixels
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import read_image
 from evercal.reports.overlay import (
@@ -218,7 +218,7 @@ def _with_corners(camera: Camera, large: Image, board: BoardSeen) -> LandmarkPic
     detected = board.view.pixels
     errors = board.projected(camera) - detected
     pixels = resize_pixels(detected, enlarged)
-    lengths = np.linalg.norm(errors, axis=1)
+    lengths = norms(errors)
     typical = float(np.nanpercentile(lengths, 90))
     largest = max(1.0, typical)
     vectors = enlarged * errors

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from evercal.geometry import SE3, Camera, resize_pixels
+from evercal.geometry import SE3, Camera, norms, resize_pixels
 from evercal.typing import Array, Image
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def draw_landmarks(
     errors = working.project(in_camera) - pixels
     enlarged = large.shape[0] / working.height
     image_scale = image.shape[0] / working.height
-    lengths = np.linalg.norm(errors, axis=1)
+    lengths = norms(errors)
     residuals = image_scale * lengths
     largest = image_scale * MAX_RESIDUAL_PX
     centres = resize_pixels(pixels, enlarged)
@@ -171,7 +171,7 @@ def overlay_lines(
 
 def exaggeration(vectors: Array) -> int:
     """Factor that makes residual vectors (n, 2) visible, the same for all: 1, 2, 5, 10, ..."""
-    lengths = np.linalg.norm(vectors, axis=1)
+    lengths = norms(vectors)
     if not np.isfinite(lengths).any():
         return 1
     longest = float(np.nanpercentile(lengths, 90))

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, Self
 import numpy as np
 
 from evercal.classes import frozen_arrays
-from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.geometry import SE3, Camera, UncertainPose, norms
 from evercal.mapping.scene_map import SceneMap
 from evercal.reports.charts import Panel, Shape
 from evercal.reports.overlay import colour_map
@@ -131,7 +131,7 @@ class Landmarks3D:
             image = keyframes.grey(i)
             grey.append(image[row, column])
             # The error of a depth 1 / d is sigma / d^2; along the ray it is as much longer.
-            distance = np.linalg.norm(local, axis=1)
+            distance = norms(local)
             along = distance * marks.sigma / marks.inverse_depth
             sigma.append(1000 * scale * along)
         joined = np.concatenate(points)

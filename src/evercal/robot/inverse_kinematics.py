@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, pose_distance
+from evercal.geometry import SE3, norms, pose_distance
 from evercal.robot.arm import Arm
 from evercal.typing import Array, BoolArray
 
@@ -155,7 +155,7 @@ def _iterate(arm: Arm, poses: SE3, starts: Array) -> tuple[Array, BoolArray]:
         at = values[active]
         miss = (arm.poses(at).inverse() @ poses[active]).log() * _WEIGHTS
         slopes = arm.slopes(at) * _WEIGHTS[:, None]
-        misses[active] = np.linalg.norm(miss, axis=1)
+        misses[active] = norms(miss)
         # Motions that leave the gripper where it is lead towards the usual posture.
         aside = 0.5 * _turned(arm, rest - at)
         miss -= (slopes @ aside[..., None])[..., 0]

@@ -4,7 +4,7 @@ from itertools import product
 
 import numpy as np
 
-from evercal.geometry import SE3
+from evercal.geometry import SE3, norms
 from evercal.robot.arm import Arm
 from evercal.robot.inverse_kinematics import inverse_kinematics
 from evercal.typing import Array
@@ -65,7 +65,7 @@ def _usual(
     position = poses.translation_m
     gripper = poses.rotation_matrix()
     forward = gripper[:, :, 2]
-    reach = np.linalg.norm(position, axis=1).max()
+    reach = norms(position).max()
     shoulder = np.zeros_like(position)
     shoulder[:, 2] = height * reach
     wrist = position - tool * reach * forward
@@ -84,7 +84,7 @@ def _usual(
         )
         / 2
     )
-    longest = np.linalg.norm(position - shoulder, axis=1).max()
+    longest = norms(position - shoulder).max()
     link_m = np.maximum(link * longest, 1.02 * half)
     up = _unit(np.cross(away, side))
     up *= np.sign(up[:, 2:])

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
 from evercal.classes import frozen_arrays
-from evercal.geometry import SE3, Camera, cross_matrix
+from evercal.geometry import SE3, Camera, cross_matrix, norms
 from evercal.geometry.normal_equations import normal_pseudo_inverse
 from evercal.typing import Array, BoolArray
 
@@ -386,4 +386,4 @@ def _apart(
     near = np.asarray(KDTree(view.points_m).query(view.points_m, count)[1])
     apart = residual - np.median(residual[near[:, 1:]], 1)
     sigma = float(np.median(np.abs(apart)) / ndtri(0.75))
-    return np.linalg.norm(apart, axis=1), max(sigma, MIN_SIGMA_PX)
+    return norms(apart), max(sigma, MIN_SIGMA_PX)

@@ -18,6 +18,7 @@ from evercal.calibration.boards.markers import (
     sizes_pooled,
 )
 from evercal.errors import InputError
+from evercal.geometry import norms
 from evercal.geometry.camera import resize_pixels
 from evercal.typing import Array, Image
 
@@ -178,8 +179,8 @@ def _is_even(grid: Array) -> bool:
     """Whether the steps from corner to corner change little along rows and columns."""
     for axis in (0, 1):
         steps = np.diff(grid, axis=axis)
-        changes = np.linalg.norm(np.diff(steps, axis=axis), axis=2)
-        mean = np.linalg.norm(steps, axis=2).mean()
+        changes = norms(np.diff(steps, axis=axis))
+        mean = norms(steps).mean()
         if (changes > _MAX_CHANGE * mean).any():
             return False
     return True

@@ -5,6 +5,7 @@ import numpy as np
 
 from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.corners import BoardView
+from evercal.geometry import norms
 from evercal.typing import Array, Image
 
 _NEIGHBOURS = 8
@@ -59,7 +60,7 @@ def sharpened(
     along, down, area = _steps(points, pixels)
     lines = []
     for step in (along, down):
-        length = np.linalg.norm(step, axis=1)
+        length = norms(step)
         reach = share * area / np.maximum(length, 1e-9) - _EDGE_BLUR_PX
         reach[reach < _MIN_REACH_PX] = np.nan
         reach = np.minimum(reach, _MAX_REACH_PX)
@@ -102,7 +103,7 @@ def _in_windows(
             criteria,
         )
         refined[rows] = corners[:, 0]
-    lost = np.linalg.norm(refined - start, axis=1) > half
+    lost = norms(refined - start) > half
     refined[lost] = start[lost]
     return refined.astype(float)
 
@@ -116,7 +117,7 @@ def _steps(
     Each corner has a quadratic map by its neighbours, so that any lens will do.
     """
     differences = points[:, None] - points
-    distances = np.linalg.norm(differences, axis=2)
+    distances = norms(differences)
     near = np.argsort(distances, 1)[:, 1 : _NEIGHBOURS + 1]
     x, y = np.moveaxis(
         points[near] - points[:, None],
@@ -150,7 +151,7 @@ def squares_by_their_sides(grey: Image, squares: Array) -> Array:
             )
             - refined
         ).reshape(-1, 2)
-        reach = np.clip(share * np.linalg.norm(sides, axis=1), 2.0, most_px)
+        reach = np.clip(share * norms(sides), 2.0, most_px)
         starts = corners + end * sides
         ends = corners + (1 - end) * sides
         edges = _edges(
@@ -256,5 +257,5 @@ def _crossings(
     crossing = np.cross(first, second)
     with np.errstate(divide="ignore", invalid="ignore"):
         refined = crossing[:, :2] / crossing[:, 2:]
-    moved = np.linalg.norm(refined - corners, axis=1)
+    moved = norms(refined - corners)
     return np.where((moved < reach_px)[:, None], refined, corners)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evercal.calibration.boards.board import Board
+from evercal.geometry import norms
 from evercal.typing import Array, BoolArray, IntArray
 
 Plane: TypeAlias = NDArray[np.complexfloating]
@@ -134,7 +135,7 @@ def layout_of(
             1 << 30,
         )
         return layout, _other_layout(markers, board, layout)
-    sides_px = np.linalg.norm(np.diff(markers.corners, axis=1), axis=2)
+    sides_px = norms(np.diff(markers.corners, axis=1))
     if np.median(sides_px) < _MIN_SIDE_PX:
         return layout, ""
     if abs(side / board.marker_share - 1) < _SIZE_ERROR:

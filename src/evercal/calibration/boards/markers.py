@@ -18,6 +18,7 @@ from evercal.calibration.boards.marker_layout import (
     layout_of,
 )
 from evercal.classes import frozen_arrays
+from evercal.geometry import norms
 from evercal.typing import Array, BoolArray, Image, IntArray
 
 _THRESHOLDS = (15, 40, 7)
@@ -144,7 +145,7 @@ def _steps(
     a, b, c, d = homogeneous.transpose(1, 0, 2)
     centres = np.cross(np.cross(a, c), np.cross(b, d))
     centres = centres / centres[:, 2:]
-    distances = np.linalg.norm(centres[:, None] - centres, axis=2)
+    distances = norms(centres[:, None] - centres)
     start = np.repeat(np.arange(n), near)
     end = np.argsort(distances, 1)[:, 1 : near + 1].ravel()
     unit_square = SQUARE.view(np.float64).reshape(4, 2).astype(np.float32)

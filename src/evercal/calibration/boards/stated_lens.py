@@ -11,7 +11,7 @@ from evercal.calibration.boards.board_poses import (
 )
 from evercal.calibration.boards.intrinsics import calibrate_camera
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, norms
 
 _WORSE = 1.3
 """Factor by which contradicted intrinsics enlarge the residuals."""
@@ -66,4 +66,4 @@ def _moved_px(
     down = stated.height - 1
     pixels = np.array([[0, 0], [right, 0], [0, down], [right, down]])
     moved = stated.project(estimated.unproject(pixels)) - pixels
-    return float(np.nanmax(np.linalg.norm(moved, axis=1), initial=0.0))
+    return float(np.nanmax(norms(moved), initial=0.0))

@@ -21,7 +21,13 @@ from evercal.calibration.from_map.hand_eye_start import HandEyeStart
 from evercal.calibration.from_map.next_views import open_position
 from evercal.calibration.verdict import verdict
 from evercal.classes import frozen_arrays
-from evercal.geometry import SE3, UncertainPose, length_mm_deg, pose_distance_mm_deg
+from evercal.geometry import (
+    SE3,
+    UncertainPose,
+    length_mm_deg,
+    norms,
+    pose_distance_mm_deg,
+)
 from evercal.mapping.built_map import (
     MOST_FOCAL_PERCENT,
     Adjusted,
@@ -287,7 +293,7 @@ def _moved_mm(offsets: ArmOffsets, frames: Sequence[Frame]) -> list[float]:
     before = offsets.arm.poses(values)
     after = offsets.arm.poses(values + offsets.values)
     shift = after.translation_m - before.translation_m
-    lengths = 1000 * np.linalg.norm(shift, axis=1)
+    lengths = 1000 * norms(shift)
     return [float(lengths.mean()), float(lengths.max())]
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evercal.errors import InputError
-from evercal.geometry import length_mm_deg
+from evercal.geometry import length_mm_deg, norms
 from evercal.mapping.built_map import BuiltMap
 from evercal.recordings.frame import Frame
 from evercal.typing import Array
@@ -92,7 +92,7 @@ def _range_deg(background: Array) -> float:
         return np.nan
     places = range(LEAST_FRAMES, len(known) - LEAST_FRAMES + 1)
     steps = [np.median(known[k:], 0) - np.median(known[:k], 0) for k in places]
-    return float(np.rad2deg(np.linalg.norm(steps, axis=1).max()))
+    return float(np.rad2deg(norms(steps).max()))
 
 
 def largest_step(values: Array) -> Step | None:

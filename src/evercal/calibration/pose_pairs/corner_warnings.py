@@ -9,6 +9,7 @@ from evercal.calibration.boards.intrinsics import moved_lens
 from evercal.calibration.pose_pairs.fit import HandEyeFit
 from evercal.calibration.pose_pairs.pairs import BoardCorners, Measured
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
+from evercal.geometry import norms
 
 _LENS_SIGMAS = 3.0
 """Deviation of stated intrinsics from the estimate that is reported, standard deviations."""
@@ -61,7 +62,7 @@ def corner_warnings(
     if (sigmas[4:] >= _LENS_SIGMAS).any():
         pixels = np.array([[0, 0], [camera.width - 1, camera.height - 1]])
         stated_rays = corners.camera.unproject(pixels)
-        moved = np.linalg.norm(camera.project(stated_rays) - pixels, axis=1)
+        moved = norms(camera.project(stated_rays) - pixels)
         yield (
             "the stated distortion contradicts the corners, which move by"
             f" {np.nanmax(moved, initial=0.0):.1f} px in the corners of the image: check `camera`,"

@@ -25,6 +25,7 @@ from evercal.calibration.pose_pairs.readings import (
 )
 from evercal.calibration.pose_pairs.starts import quick_fit
 from evercal.errors import InputError
+from evercal.geometry import norms
 from evercal.robot.mount import MountName, mount_named
 
 _MAX_METRES = 0.01
@@ -156,7 +157,7 @@ def _require_plausible(
 ) -> None:
     """Refuse pairs that agree, but whose geometry fits another reading far better."""
     board = given.pairs.camera_from_board.translation_m
-    rays = board / np.linalg.norm(board, axis=1)[:, None].clip(1e-9)
+    rays = board / norms(board)[:, None].clip(1e-9)
     behind = (rays[:, 2] < 0).mean() > _MOST
     mean = rays.mean(0)
     coherent = float(np.linalg.norm(mean))
@@ -176,7 +177,7 @@ def _require_plausible(
             likely = reading
     board = likely.pairs.camera_from_board.translation_m
     # Within 60 degrees of the optical axis, where a camera may see the board.
-    ahead = (board[:, 2] > 0.5 * np.linalg.norm(board, axis=1)).mean()
+    ahead = (board[:, 2] > 0.5 * norms(board)).mean()
     if highest > _plausibility(given, fit) + _CLEARLY and ahead > _MOST:
         raise InputError(likely.message)
     if behind:
@@ -200,11 +201,11 @@ def _plausibility(reading: Reading, fit: Agreement) -> float:
     usual = np.array([_FAR_FROM_BASE_M, _NEAR_M])
     if mount_named(reading.mount).moves:
         usual = usual[::-1]
-    lengths = np.linalg.norm(fit.at.translations, axis=1)
+    lengths = norms(fit.at.translations)
     lengths = np.maximum(lengths, 0.03)
     deviations = np.log(lengths / usual) / _SPREAD
     board = reading.pairs.camera_from_board.translation_m
-    distance = np.linalg.norm(board, axis=1).clip(1e-9)
+    distance = norms(board).clip(1e-9)
     cosine = board[:, 2] / distance
     angle = np.arccos(np.clip(cosine, -1, 1))
     # Half of a normal distribution, mixed with any angle from 0 to pi.

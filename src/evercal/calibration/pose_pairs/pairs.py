@@ -28,7 +28,7 @@ from evercal.calibration.boards.intrinsics import (
 from evercal.calibration.boards.row_shift import CornerNoise
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation
 from evercal.classes import frozen_arrays
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry import SE3, Camera, norms, pose_distance
 from evercal.recordings.poses.conventions import PoseConvention
 from evercal.robot.mount import MountName, mount_named
 from evercal.typing import Array, BoolArray, IntArray
@@ -131,7 +131,7 @@ class PosePairs:
         _, robot_rad = pose_distance(robot[i], robot[j])
         camera_m, camera_rad = pose_distance(camera[i], camera[j])
         if not scale_known:
-            distances = np.linalg.norm(camera.translation_m, axis=1)
+            distances = norms(camera.translation_m)
             camera_m = camera_m / max(float(np.median(distances)), 1e-12)
         same = (camera_m < _SAME_CAMERA_M) & (camera_rad < _SAME_CAMERA_RAD)
         same &= robot_rad < _SAME_ROBOT_RAD

@@ -6,7 +6,7 @@ import numpy as np
 
 from evercal.calibration.pose_pairs.fit import HandEyeFit
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
-from evercal.geometry import length_mm_deg
+from evercal.geometry import length_mm_deg, norms
 from evercal.typing import IntArray
 
 _LEAST_ROWS = 3
@@ -39,7 +39,7 @@ def second_group(
     ):
         each = residual.reshape(-1, 6)
         middle = np.median(each, 0)
-        apart = np.linalg.norm((each - middle) / noise, axis=1)
+        apart = norms((each - middle) / noise)
         scatter = float(np.median(apart) / np.linalg.norm(middle / noise))
         if scatter < best:
             best = scatter

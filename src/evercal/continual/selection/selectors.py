@@ -11,6 +11,7 @@ import numpy as np
 from numpy.random import Generator
 
 from evercal.continual.selection.frame_statistics import FrameStatistics
+from evercal.geometry import norms
 from evercal.mapping.selection import SarsOptions, select_sars
 from evercal.typing import Array, IntArray
 
@@ -47,7 +48,7 @@ def select_herding(features: Array, capacity: int) -> IntArray:
     selected = []
     for count in range(1, min(capacity, len(unit)) + 1):
         means = (total + unit) / count
-        gap = np.linalg.norm(mean - means, axis=1)
+        gap = norms(mean - means)
         frame = int(np.where(free, gap, np.inf).argmin())
         free[frame] = False
         total += unit[frame]

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from evercal.classes import frozen
+from evercal.geometry import norms
 from evercal.geometry.se3 import SE3
 from evercal.recordings.poses.row_files import by_alias
 from evercal.typing import Array, BoolArray
@@ -266,7 +267,7 @@ def _rotations(numbers: Array, convention: PoseConvention) -> Rotation:
         return Rotation.from_euler(
             convention.layout, numbers, degrees=convention.degrees
         )
-    length = np.linalg.norm(numbers, axis=-1)
+    length = norms(numbers)
     _refuse(
         np.abs(length - 1.0) > _TOLERANCE,
         f"the quaternion is not of length 1 (shortest {length.min(initial=1.0):.4g}, longest"

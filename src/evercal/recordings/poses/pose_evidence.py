@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from evercal.geometry import SE3
+from evercal.geometry import SE3, norms
 from evercal.recordings.frame import Frame
 from evercal.typing import Array, Float32Array
 
@@ -65,7 +65,7 @@ def rotation_warnings(
     error_of = _error_deg
     better = BETTER
     if not of_camera:
-        angles = np.linalg.norm(measured, axis=1)
+        angles = norms(measured)
         if np.rad2deg(np.median(angles)) < STILL_DEG:
             return [
                 "the gripper rotates and the images hardly do; does the camera stand still, or are"
@@ -229,7 +229,7 @@ def _fitted_error_deg(measured: Array, stated: Array) -> float:
     for _ in range(5):  # iterative reweighting against outliers
         rotation, *_ = Rotation.align_vectors(measured, stated, weights)
         rotated = rotation.apply(stated)
-        distance = np.linalg.norm(rotated - measured, axis=1)
+        distance = norms(rotated - measured)
         scale = max(float(np.median(distance)), 1e-6)
         weights = 1 / (1 + (distance / scale) ** 2)
     return _error_deg(measured, rotated)

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evercal.geometry import norms
 from evercal.geometry.se3 import SE3
 from evercal.recordings.poses.conventions import (
     ConventionError,
@@ -40,12 +41,12 @@ def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
         positions = numbers[..., :3]
         if convention.is_matrix:
             positions = matrices_from_numbers(numbers, convention.layout)[..., :3, 3]
-        _check_lengths(np.linalg.norm(positions, axis=-1), convention)
+        _check_lengths(norms(positions), convention)
     if not convention.has_angles:
         return
     angles = np.abs(numbers[..., 3:])
     if convention.layout == "vector":
-        angles = np.linalg.norm(angles, axis=-1)
+        angles = norms(angles)
     largest = float(angles.max(initial=0.0))
     if convention.degrees and largest > _MAX_DEG:
         raise ValueError(

@@ -13,7 +13,7 @@ from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.calibration.export.formats import FORMATS, export_files
 from evercal.calibration.from_map.next_views import NextViews, looked_at, next_views
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry import SE3, Camera, norms, pose_distance
 from evercal.live.coverage import IMAGES, SAME_DEG, SAME_MM, Coverage, Sample, coverage
 from evercal.live.recorder import (
     JPEG_QUALITY,
@@ -354,7 +354,7 @@ def _around(recorded: SE3, good: SE3, gripper_from_camera: SE3 | None) -> SE3:
     start = cameras[rng.integers(len(cameras), size=_CANDIDATES)]
     turns, closer = np.zeros((2, _CANDIDATES, 6))
     turns[:, 3:] = rng.uniform(-_TURN_RAD, _TURN_RAD, (_CANDIDATES, 3))
-    distance = np.linalg.norm(start.translation_m - point_m, axis=1)
+    distance = norms(start.translation_m - point_m)
     closer[:, 2] = distance * rng.uniform(-_NEARER, _NEARER, _CANDIDATES)
     closer[:, 5] = rng.uniform(-_ROLL_RAD, _ROLL_RAD, _CANDIDATES)
     there = SE3.from_translation(point_m)

@@ -9,7 +9,7 @@ import viser
 
 from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError, optional_module
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, norms
 from evercal.mapping.scene_map import SceneMap
 from evercal.reports.overlay import resized
 from evercal.reports.scene import (
@@ -94,7 +94,7 @@ class DrawnMap:
         self.keyframes = {scene.name: keyframe_views(scene) for scene in scenes}
         # Twice the median distance of landmarks from their median.
         points = self.landmarks[scenes[0].name].points_m
-        distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+        distances = norms(points - np.median(points, axis=0))
         self.extent_m = max(2 * float(np.median(distances)), 0.05)
         self.frustum_m = 0.03 * self.extent_m
         self._nodes: dict[str, viser.FrameHandle] = {}
