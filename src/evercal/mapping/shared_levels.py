@@ -8,27 +8,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize
 
 from evercal.robot.pose_errors import (
+    FIRST_SHARED,
     WANTED,
     SharedErrors,
     SharedNoise,
-    mean_variances,
-    variance_uncertainty,
+    most_likely,
 )
 from evercal.typing import Array
 
 _MOST_JUDGES = 60
 """Maximum number of frames that estimate the sizes."""
-_SMALLEST = -16.0
-"""Smallest logarithm of a variance, from that of its start."""
-_LARGEST = 9.0
-"""Largest one."""
-_FIRST_SHARED = 0.3
-"""First variance of a shared kind, in variances of independent errors."""
-_PRECISION = 1e-5
-"""Relative change of the likelihood that ends its maximization."""
 _LEAST_INFORMATION = 1e-9
 """Lower bound of what the images say, as a share of the most in any direction."""
 
@@ -80,38 +71,6 @@ class _Seen:
             slope.append(size * (effects * (rest @ effects)).sum() + usual)
         return float(value), np.array(slope)
 
-    def best(self, start: Array) -> tuple[Array, float]:
-        """Variances (2 + k,) of the largest likelihood, and twice its negative logarithm."""
-        logarithms = np.log(start)
-        bounds = [(value + _SMALLEST, value + _LARGEST) for value in logarithms]
-        found = minimize(
-            self.likelihood,
-            logarithms,
-            jac=True,
-            method="L-BFGS-B",
-            bounds=bounds,
-            options={"ftol": _PRECISION},
-        )
-        return np.exp(found.x), float(found.fun)
-
-    def means(self, variance: Array) -> Array:
-        """Mean of each variance (2 + k,), see `mean_variances`."""
-        inverse = self.noise(variance).inverse()
-        posterior = np.linalg.inv(self.information + inverse)
-        pull = inverse - inverse @ posterior @ inverse
-        own = []
-        for unit in self.unit:
-            every = np.sqrt(np.einsum("nii->ni", unit).ravel())
-            own.append(np.diag(every)[:, every > 0])
-        return mean_variances(
-            variance,
-            variance_uncertainty(
-                pull,
-                own,
-                self.kinds,
-            ),
-        )
-
 
 def shared_levels(
     errors: Array,
@@ -156,10 +115,11 @@ def shared_levels(
         tuple(unit),
         {name: kind.of_rows(judges) for name, kind in kinds.items()},
     )
-    start = sigma[[0, 3]] ** 2
-    _, alone = replace(seen, kinds={}).best(start)
-    first = [start[int(not name.endswith("translation"))] for name in kinds]
-    found, least = seen.best(np.r_[start, _FIRST_SHARED * np.array(first)])
+    first = sigma[[0, 3]] ** 2
+    _, alone = most_likely(replace(seen, kinds={}).likelihood, first, first)
+    shared = [first[int(not name.endswith("translation"))] for name in kinds]
+    first = np.r_[first, FIRST_SHARED * np.array(shared)]
+    found, least = most_likely(seen.likelihood, first, first)
     if (alone - least) / 2 < WANTED:
         return None
-    return seen.means(found)
+    return found

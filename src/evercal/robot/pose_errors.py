@@ -13,16 +13,15 @@ inverted as such: M. Woodbury, Inverting modified matrices, 1950.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, cho_solve, solve_triangular
-from scipy.stats import norm
+from scipy.optimize import minimize
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
-from evercal.geometry.normal_equations import normal_inverse
 from evercal.typing import Array, BoolArray, IntArray
 
 if TYPE_CHECKING:
@@ -47,17 +46,14 @@ _LEAST_SHARE = 1e-3
 """Effects with a smaller share of the variance of the largest are left out."""
 
 
-_AT_ZERO = 0.3
-"""Mean of a variance whose likelihood falls from zero on like that of a normal variable, by the
-mean of the positive half of that variable."""
-_LEAST_LEFT = 0.5
-"""Share of a variance that is left at least."""
-_MOST_RATIO = 30.0
-"""Standard deviations from zero at which a variance is known as well as any."""
-_RIDGE = 1e-9
-"""Share by which kinds of noise differ at least."""
-_NOTHING_SEEN = 2 * (_AT_ZERO * np.sqrt(2 / np.pi)) ** 2
-"""Information on a variance without any residual, by which its mean is that of the prior."""
+FIRST_SHARED = 0.3
+"""First variance of a shared kind, in variances of the residuals."""
+_SMALLEST = -16.0
+"""Smallest logarithm of a variance, from that of its start."""
+_LARGEST = 9.0
+"""Largest one."""
+_PRECISION = 1e-5
+"""Relative change of the likelihood that ends its maximization."""
 
 
 class SharedErrors(NamedTuple):
@@ -275,38 +271,25 @@ class SharedNoise:
         return float(own + 2 * np.log(np.diag(self._root)).sum())
 
 
-def variance_uncertainty(
-    pull: Array, independent: Sequence[Array], shared: Mapping[str, SharedErrors]
-) -> Array:
-    """(k, k) covariance of the variances of all kinds, by their expected information.
+def most_likely(
+    likelihood: Callable[[Array], tuple[float, Array]],
+    first: Array,
+    start: Array,
+) -> tuple[Array, float]:
+    """Variances (k,) of the largest likelihood, and twice its negative logarithm.
 
     Args:
-        pull: (6 n, 6 n) inverse covariance of the residuals less what the unknowns explain.
-        independent: (6 n, c) effects of each kind that poses do not share.
-        shared: Kinds that they share.
+        likelihood: Twice its negative logarithm, and the slope, by logarithms of variances.
+        first: (k,) rough variances, by which the search is bounded.
+        start: (k,) variances where the search starts.
     """
-    effects = list(independent)
-    for kind in shared.values():
-        effects.append(kind.slopes.reshape(len(pull), -1))
-    ranks = [kind.shape[1] for kind in effects]
-    # Which effects are of which kind.
-    member = np.eye(len(effects))[np.repeat(np.arange(len(effects)), ranks)]
-    every = np.concatenate(effects, 1)
-    between = (every.T @ pull @ every) ** 2
-    information = member.T @ between @ member
-    for k, kind in enumerate(shared.values(), len(independent)):
-        information[k, k] += _NOTHING_SEEN / kind.usual**4
-    return 2 * normal_inverse(information, _RIDGE)
-
-
-def mean_variances(variance: Array, uncertainty: Array) -> Array:
-    """Means (k,) of variances whose likelihood is largest at `variance`.
-
-    They differ where it is largest near zero, by what the residuals do not exclude.
-    """
-    sigma = np.sqrt(np.diag(uncertainty))
-    ratio = np.minimum(variance / sigma, _MOST_RATIO)
-    excess = _AT_ZERO * sigma * norm.pdf(ratio) / norm.cdf(ratio)
-    # A kind that grows takes from kinds that look like it.
-    shift = uncertainty @ (excess / sigma**2)
-    return np.maximum(variance + shift, _LEAST_LEFT * variance)
+    bounds = [(value + _SMALLEST, value + _LARGEST) for value in np.log(first)]
+    found = minimize(
+        likelihood,
+        np.log(start),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"ftol": _PRECISION},
+    )
+    return np.exp(found.x), float(found.fun)

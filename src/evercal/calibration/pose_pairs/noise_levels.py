@@ -5,34 +5,34 @@ R. Thompson, Recovery of inter-block information, 1971.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.optimize import minimize
-from scipy.stats import chi2, f
+from scipy.stats import chi2, f, norm
 
 from evercal.calibration.pose_pairs.pose_equation import System
-from evercal.robot.pose_errors import (
-    SharedNoise,
-    mean_variances,
-    variance_uncertainty,
-)
+from evercal.geometry.normal_equations import normal_inverse
+from evercal.robot.pose_errors import FIRST_SHARED, SharedNoise, most_likely
 from evercal.typing import Array
 
 FLOOR = np.diag([1e-14] * 6)
 """Minimum variance of a pose, metres^2 and radians^2, so that exact poses have finite weight."""
-_SMALLEST = -16.0
-"""Smallest logarithm of a variance, from that of its start."""
-_LARGEST = 9.0
-"""Largest one."""
-_FIRST_SHARED = 0.3
-"""First variance of a kind that poses share, in variances of the residuals."""
-_PRECISION = 1e-5
-"""Relative change of the likelihood that ends its maximization."""
 
 _PSEUDO = 1.0
 """Number of pseudo-residuals of each independent kind, as large as all residuals together: without
 them, few poses have a likelihood that is largest where one kind is zero and fits exactly."""
+_AT_ZERO = 0.3
+"""Mean of a variance whose likelihood falls from zero on like that of a normal variable, by the
+mean of the positive half of that variable."""
+_LEAST_LEFT = 0.5
+"""Share of a variance that is left at least."""
+_MOST_RATIO = 30.0
+"""Standard deviations from zero at which a variance is known as well as any."""
+_RIDGE = 1e-9
+"""Share by which kinds of noise differ at least."""
+_NOTHING_SEEN = 2 * (_AT_ZERO * np.sqrt(2 / np.pi)) ** 2
+"""Information on a variance without any residual, by which its mean is that of the prior."""
 _COVERAGE = 0.95
 """Coverage of the ellipsoids that `ellipsoid_factor` widens."""
 
@@ -73,31 +73,23 @@ def estimate_levels(system: System, start: Array | None = None) -> Array:
 
     The kinds are those of `System.directions`, then of `System.shared`.
     """
-    first = _first_levels(system)
-    at = first
-    if start is not None:
-        at = np.clip(start, 1e-5 * first, 1e3 * first)
-    bounds = [(value + _SMALLEST, value + _LARGEST) for value in np.log(first)]
-    found = minimize(
-        _likelihood,
-        np.log(at),
-        args=(system, first),
-        jac=True,
-        method="L-BFGS-B",
-        bounds=bounds,
-        options={"ftol": _PRECISION},
-    )
-    return np.exp(found.x)
+    return _most_likely(system, start)[0]
 
 
 def evidence_of_shared(system: System) -> float:
     """Logarithm of the likelihood ratio of a system and the same without errors that are shared."""
-    alone = replace(system, shared={})
-    least = []
-    for one in (alone, system):
-        logarithms = np.log(estimate_levels(one))
-        least.append(_likelihood(logarithms, one, _first_levels(one))[0])
-    return (least[0] - least[1]) / 2
+    _, alone = _most_likely(replace(system, shared={}))
+    _, least = _most_likely(system)
+    return (alone - least) / 2
+
+
+def _most_likely(system: System, start: Array | None = None) -> tuple[Array, float]:
+    first = _first_levels(system)
+    at = first
+    if start is not None:
+        at = np.clip(start, 1e-5 * first, 1e3 * first)
+    likelihood = partial(_likelihood, system=system, first=first)
+    return most_likely(likelihood, first, at)
 
 
 def ellipsoid_factor(
@@ -133,8 +125,17 @@ def ellipsoid_factor(
 
 
 def mean_levels(system: System, variance: Array) -> Array:
-    """Mean of each variance (k,), given that where its likelihood is largest."""
-    return mean_variances(variance, level_uncertainty(system, variance))
+    """Mean of each variance (k,), given that where its likelihood is largest.
+
+    They differ where it is largest near zero, by what the residuals do not exclude.
+    """
+    uncertainty = level_uncertainty(system, variance)
+    sigma = np.sqrt(np.diag(uncertainty))
+    ratio = np.minimum(variance / sigma, _MOST_RATIO)
+    excess = _AT_ZERO * sigma * norm.pdf(ratio) / norm.cdf(ratio)
+    # A kind that grows takes from kinds that look like it.
+    shift = uncertainty @ (excess / sigma**2)
+    return np.maximum(variance + shift, _LEAST_LEFT * variance)
 
 
 def level_uncertainty(system: System, variance: Array) -> Array:
@@ -144,11 +145,22 @@ def level_uncertainty(system: System, variance: Array) -> Array:
     weighted = noise.weighted(system.jacobian)
     factor, _ = _factor(normal_matrix(system, weighted))
     explained = (weighted @ factor).reshape(rows, -1)
-    kinds = []
-    for directions in system.directions.values():
-        kinds.append(np.asarray(block_diag(*directions)))
     pull = noise.inverse() - explained @ explained.T
-    return variance_uncertainty(pull, kinds, system.shared)
+    effects: list[Array] = []
+    for directions in system.directions.values():
+        effects.append(np.asarray(block_diag(*directions)))
+    for kind in system.shared.values():
+        effects.append(kind.slopes.reshape(rows, -1))
+    ranks = [kind.shape[1] for kind in effects]
+    # Which effects are of which kind.
+    member = np.eye(len(effects))[np.repeat(np.arange(len(effects)), ranks)]
+    every = np.concatenate(effects, 1)
+    between = (every.T @ pull @ every) ** 2
+    information = member.T @ between @ member
+    count = len(system.directions)
+    for k, kind in enumerate(system.shared.values(), count):
+        information[k, k] += _NOTHING_SEEN / kind.usual**4
+    return 2 * normal_inverse(information, _RIDGE)
 
 
 def _likelihood(logarithms: Array, system: System, first: Array) -> tuple[float, Array]:
@@ -206,26 +218,16 @@ def _factor(normal: Array) -> tuple[Array, float]:
 
 
 def _first_levels(system: System) -> Array:
-    """Rough variances of all kinds, by the residuals of a fit with equal weights."""
-    rough = _levels_of(system, system.residual)
-    alone = replace(system, shared={})
-    noise = Noise(alone, rough[: len(system.directions)])
-    weighted = noise.weighted(system.jacobian)
-    factor, _ = _factor(normal_matrix(system, weighted))
-    step = -factor @ (factor.T @ slope_of(system, weighted))
-    return _levels_of(system, system.residual + system.jacobian @ step)
-
-
-def _levels_of(system: System, residual: Array) -> Array:
-    metres2 = np.mean(residual[:, :3] ** 2)
-    radians2 = np.mean(residual[:, 3:] ** 2)
+    """Rough variances of all kinds, by the residuals."""
+    metres2 = np.mean(system.residual[:, :3] ** 2)
+    radians2 = np.mean(system.residual[:, 3:] ** 2)
     levels = []
     for kind in system.directions:
         own = radians2 if kind.startswith("rotation") else metres2
         levels.append(2 / len(system.directions) * own)
     for kind in system.shared:
         own = metres2 if kind.endswith("translation") else radians2
-        levels.append(_FIRST_SHARED * own)
+        levels.append(FIRST_SHARED * own)
     return np.array(levels) + 1e-18
 
 

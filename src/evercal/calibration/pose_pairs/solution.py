@@ -46,20 +46,14 @@ _CAUSES = {
 """Names of the error terms, by kind of noise and group of extras."""
 
 
-_ORIGINS = {
-    "joint": "arm",
-    "smooth": "arm",
-    "drift": "arm",
-    "intrinsics": "lens",
-}
-"""Where an error comes from, by the first word of its kind; others come from the images."""
+_OF_ARM = ("joint", "smooth", "drift", "rotation about gripper")
+"""Kinds that come from the arm begin so; intrinsics from the lens, and others from the images."""
 
 
 def _origin(kind: str) -> str:
-    first, *_ = kind.split()
-    if kind == "rotation about gripper":
+    if kind.startswith(_OF_ARM):
         return "arm"
-    return _ORIGINS.get(first, "images")
+    return "lens" if kind == "intrinsics" else "images"
 
 
 @dataclass(frozen=True, eq=False)
