@@ -243,9 +243,8 @@ def held_out_error(
     for fold in range(FOLDS):
         held_out = np.arange(len(rows)) % FOLDS == fold
         at = _refined(equation, fit, rows[~held_out])
-        parts = equation[np.concatenate([rows[~held_out], rows[held_out]])]
-        use = np.arange(len(rows)) < (~held_out).sum()
-        residual = predicted(parts, at, fit.levels, use).residual.reshape(-1, 2, 3)
+        every, _ = predicted(equation[rows], at, fit.levels, ~held_out)
+        residual = every[held_out].reshape(-1, 2, 3)
         lengths.append(np.linalg.norm(residual, axis=2))
     error = np.concatenate(lengths) * (1000.0, 180 / np.pi)
     median_mm, median_deg = np.median(error, 0).tolist()

@@ -1,7 +1,6 @@
 """Robust joint estimate of all unknowns of the hand-eye equation, and its covariance."""
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2, f
@@ -53,7 +52,8 @@ class HandEyeFit:
     inliers: BoolArray
     """(n,) poses used for the estimate."""
     residual: Array
-    """(n, 6) residuals of all poses in the fixed frame, metres and radians."""
+    """(n, 6) residuals of all poses in the fixed frame, less the errors that poses share; metres
+    and radians."""
     distance2: Array
     """(n,) squared Mahalanobis distance of each residual."""
     contributions: dict[str, Array]
@@ -231,7 +231,7 @@ def _result(
         covariance=covariance,
         levels=levels,
         inliers=use,
-        residual=equation.system(at).residual,
+        residual=predicted(equation, at, levels, use)[0],
         distance2=_distances(equation, at, levels, use),
         contributions=contributions,
         moved=moved,
@@ -253,41 +253,26 @@ def _distances(
     own += 1e-3 * np.linalg.inv(noise.independent)
     distance2 = np.zeros(len(use))
     distance2[use] = (pull * np.linalg.solve(own, pull)).sum((1, 2))
-    if not use.all():
-        other = predicted(equation, at, levels, use)
-        explained = other.slope @ covariance @ other.slope.transpose(0, 2, 1)
-        spread = (1 + 1e-3) * other.noise + explained
-        whitened = np.linalg.solve(spread, other.residual[..., None])[..., 0]
-        distance2[~use] = (other.residual * whitened).sum(1)
+    residual, left = predicted(equation, at, levels, use)
+    slope = equation.system(at).jacobian
+    spread = (1 + 1e-3) * left + slope @ covariance @ slope.transpose(0, 2, 1)
+    whitened = np.linalg.solve(spread, residual[..., None])[..., 0]
+    distance2[~use] = (residual * whitened).sum(1)[~use]
     return distance2
-
-
-class Predicted(NamedTuple):
-    """Residuals of poses that were not used, less the errors that they share with used ones."""
-
-    residual: Array
-    """(m, 6)."""
-    slope: Array
-    """(m, 6, p) derivatives by the unknowns."""
-    noise: Array
-    """(m, 6, 6) covariance, if the unknowns were known."""
 
 
 def predicted(
     equation: PoseEquation, at: Unknowns, levels: Array, use: BoolArray
-) -> Predicted:
-    """Predict the residuals of the poses that are not used, by the others."""
+) -> tuple[Array, Array]:
+    """Residuals (n, 6) less the errors that poses share, by those that are used.
+
+    Also return the covariance (n, 6, 6) of the rest, if the unknowns were known.
+    """
     used = equation[use].system(at)
     noise = Noise(used, levels)
-    other = equation[~use].system(at)
-    others = Noise(other, levels)
-    rank = noise.shared.shape[2]
-    effects = noise.shared.reshape(used.residual.size, rank).T
-    mean = effects @ noise.weighted(used.residual[..., None]).ravel()
-    by_unknowns = effects @ noise.weighted(used.jacobian).reshape(effects.shape[1], -1)
-    return Predicted(
-        other.residual - others.shared @ mean,
-        other.jacobian - others.shared @ by_unknowns,
-        others.independent
-        + others.shared @ noise.unexplained() @ others.shared.transpose(0, 2, 1),
-    )
+    pull = noise.weighted(used.residual[..., None])
+    effects = np.tensordot(noise.shared, pull[..., 0], ((0, 1), (0, 1)))
+    every = equation.system(at)
+    others = Noise(every, levels)
+    left = others.shared @ noise.unexplained() @ others.shared.transpose(0, 2, 1)
+    return every.residual - others.shared @ effects, others.independent + left

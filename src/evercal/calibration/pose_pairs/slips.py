@@ -8,7 +8,6 @@ no other check notices it.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.stats import f
 
 from evercal.calibration.pose_pairs.fit import HandEyeFit
@@ -123,24 +122,15 @@ def find_slip(
 def _steps(
     equation: PoseEquation, fit: HandEyeFit, order: IntArray, use: BoolArray
 ) -> list[_Step]:
-    """Fit each step, and none; the poses `use` estimate it, but all judge it.
-
-    Errors of an arm that grow with its position are no step: they are unknowns as large as the
-    noise, over the root mean square of the positions.
-    """
+    """Fit each step, and none; the poses `use` estimate it, but all judge it."""
     system = equation[order].system(fit.at)
     covariance = Noise(system, fit.levels).independent
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     residual = (whiten @ system.residual[..., None])[..., 0]
-    place = equation.robot_translation[order] - equation.robot_translation.mean(0)
-    place /= max(float(np.sqrt((place**2).sum(1).mean())), 1e-9)
-    noise = whiten @ np.linalg.cholesky(covariance.mean(0))
-    by_place = [noise * place[:, k, None, None] for k in range(3)]
-    jacobian = np.concatenate([whiten @ system.jacobian, *by_place], 2)
+    jacobian = whiten @ system.jacobian
     used = jacobian.transpose(0, 2, 1) * use[:, None, None]
-    normal = (used @ jacobian).sum(0) + block_diag(system.prior, np.eye(18))
-    from_prior = np.r_[system.prior @ system.change, np.zeros(18)]
-    gradient = (used @ residual[..., None]).sum((0, 2)) + from_prior
+    normal = (used @ jacobian).sum(0) + system.prior
+    gradient = (used @ residual[..., None]).sum((0, 2)) + system.prior @ system.change
     refined = residual - jacobian @ (clipped_inverse(normal) @ gradient)
     steps = [_Step(_cost(residual)), _Step(_cost(refined))]
     for what, first in _FIRST_UNKNOWN.items():
