@@ -32,6 +32,8 @@ _UNKNOWN_RAD = np.deg2rad(0.2)
 WANTED = 1.0
 """Evidence of shared errors that takes them in: the logarithm of the likelihood ratio to
 independent errors."""
+_LINKS_M = 3e-4
+"""Usual standard deviation of the lengths of links."""
 _USUAL_REACH_M = 0.5
 """Lever on which such a rotation moves a gripper."""
 _SMOOTH_M = 1.0
@@ -118,10 +120,10 @@ def shared_errors(base_from_gripper: SE3, errors: ArmErrors) -> dict[str, Shared
     """Kinds of errors of gripper poses (n,) in the order of time, by name."""
     from evercal.robot.joint_slopes import joint_slopes
 
-    slopes = joint_slopes(
-        base_from_gripper,
-        errors.arm,
-    )
+    usual = joint_slopes(base_from_gripper, None)
+    slopes = usual
+    if errors.arm is not None:
+        slopes = joint_slopes(base_from_gripper, errors.arm)
     joints = _main_effects(slopes)
     accuracy_rad = errors.offset_rad(slopes)
     n = len(base_from_gripper)
@@ -139,6 +141,13 @@ def shared_errors(base_from_gripper: SE3, errors: ArmErrors) -> dict[str, Shared
     kinds["joint offsets"] = SharedErrors(
         joints,
         accuracy_rad,
+    )
+    # Along the axes of joints, as of a usual arm: they have all directions of links.
+    links = np.zeros_like(usual)
+    links[:, :3] = usual[:, 3:]
+    kinds["link lengths translation"] = SharedErrors(
+        _main_effects(links),
+        _LINKS_M,
     )
     correlations = {
         "smooth": smooth,

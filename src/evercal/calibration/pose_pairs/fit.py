@@ -249,8 +249,12 @@ def _distances(
     covariance = clipped_inverse(normal_matrix(used, weighted))
     pull = noise.weighted(used.residual[..., None])
     own = noise.blocks() - weighted @ covariance @ weighted.transpose(0, 2, 1)
+    # In units of the noise, whose axes may differ by orders of magnitude.
+    unit = np.linalg.cholesky(noise.independent)
+    turned = unit.transpose(0, 2, 1)
     # Alone, one pose has no spread on some axis.
-    own += 1e-3 * np.linalg.inv(noise.independent)
+    own = turned @ own @ unit + 1e-3 * np.eye(6)
+    pull = turned @ pull
     distance2 = np.zeros(len(use))
     distance2[use] = (pull * np.linalg.solve(own, pull)).sum((1, 2))
     residual, left = predicted(equation, at, levels, use)
