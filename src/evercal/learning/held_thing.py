@@ -50,8 +50,6 @@ from evercal.robot.pose_errors import ArmErrors
 WHOLE_SIDE = 960
 """Short side of the images whose features are matched, pixels, where reduced ones do not suffice:
 the thing may be small."""
-SWEPT_FRAMES = 8
-"""Maximum number of frames that a keyframe is tracked in; with 12 the answer is the same."""
 
 
 @one_product_thread()
@@ -90,8 +88,7 @@ def learn_held_thing(
     options = replace(
         options,
         arm=start.arm,
-        confirmed=start.confirmed,
-        swept_frames=SWEPT_FRAMES,
+        confirmed=tuple(start.confirmed),
         whole=recording.train[0].camera,
         errors=errors or ArmErrors(),
     )

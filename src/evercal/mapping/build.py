@@ -82,7 +82,7 @@ class MapOptions:
     """Rounds of tracking and adjusting; the second runs only if the first moved something."""
     arm: ArmOffsets | None = None
     """Joint offsets that the stated poses contain, in a hand-eye calibration; they are adjusted."""
-    confirmed: frozenset[str] = frozenset()
+    confirmed: tuple[str, ...] = ()
     """Names of frames whose stated poses are known to agree with the images."""
     mount: Mount | None = None
     """Mount of a camera whose poses follow from those of a gripper; see `for_hand_eye`."""

@@ -8,7 +8,7 @@ The encoder mistakes one square of a chessboard for another, so this is only a s
 an essential matrix decide: they confirm the pose, contradict it, or cannot track the frame.
 """
 
-from collections.abc import Sequence, Set
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -93,7 +93,7 @@ def matched_pairs(recording: PreparedFrames) -> list[MatchedPair]:
 def check_poses(
     recording: PreparedFrames,
     pairs: list[MatchedPair],
-    confirmed: Set[str] = frozenset(),
+    confirmed: Collection[str] = (),
 ) -> PoseCheck:
     """Find frames whose stated pose contradicts most of their partners, unless it is confirmed."""
     count = len(recording)
