@@ -1,7 +1,7 @@
-"""Types of arrays by element, and of paths."""
+"""Types of arrays by element, of paths and of records."""
 
 import os
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,3 +18,7 @@ Image: TypeAlias = NDArray[np.uint8]
 """(H, W, 3) RGB or (H, W) grey."""
 PathLike: TypeAlias = str | os.PathLike[str]
 """A file or folder of the caller."""
+Strings: TypeAlias = tuple[str, ...]
+"""Names or sentences."""
+JsonObject: TypeAlias = dict[str, Any]
+"""Values of JSON by name."""

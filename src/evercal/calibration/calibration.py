@@ -33,7 +33,7 @@ from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation, pose_di
 from evercal.robot.mount import MountName, mount_named
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
-from evercal.typing import Array, PathLike
+from evercal.typing import Array, JsonObject, PathLike
 
 if TYPE_CHECKING:
     from evercal.calibration.comparison import Comparison
@@ -154,7 +154,7 @@ class Calibration(FramedPose):
         """The same of the rotation."""
         return axis_deviation(self.covariance)[1]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the JSON values described at the top of this file."""
         return {
             "format": FORMAT,
@@ -263,7 +263,7 @@ class RigPair(NamedTuple):
     second: str
     first_from_second: UncertainPose
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return JSON values."""
         pose = self.first_from_second.pose
         return {
@@ -284,7 +284,7 @@ class Rig:
     relative: tuple[RigPair, ...]
     """One for every two cameras."""
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return JSON values."""
         return {
             "format": "evercal-rig",

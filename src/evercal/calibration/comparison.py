@@ -7,7 +7,6 @@ pose explains.
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -18,7 +17,7 @@ from evercal.errors import InputError
 from evercal.geometry import axis_deviation, length_mm_deg, norms
 from evercal.geometry.rays import angles, fit_rays
 from evercal.robot.mount import mount_named
-from evercal.typing import Array
+from evercal.typing import Array, JsonObject, Strings
 
 USUAL_DISTANCE_M = 0.5
 """Working distance where none is stated: from a wrist camera to a table."""
@@ -67,11 +66,11 @@ class Comparison:
     """The same of the rotation."""
     d2: float
     """Squared Mahalanobis distance of the poses: 6 is expected, 95 % are below 12.6."""
-    shared: tuple[str, ...]
+    shared: Strings
     """What both have in common, so that its errors do not show in the difference."""
     cause: str
     """Likeliest cause of a disagreement; empty if both agree."""
-    notes: tuple[str, ...]
+    notes: Strings
     """How they were compared."""
 
     @property
@@ -87,7 +86,7 @@ class Comparison:
             return f"These two agree {bound}"
         return f"These two disagree {bound} The likeliest cause: {self.cause}."
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return JSON values."""
         return {**asdict(self), "agree": self.agree, "verdict": self.verdict}
 
@@ -184,7 +183,7 @@ def pooled_scatter(measured: Scatter) -> Array:
     return total / weight
 
 
-def _shared(first: FramedPose, second: FramedPose) -> tuple[str, ...]:
+def _shared(first: FramedPose, second: FramedPose) -> Strings:
     shared = []
     if first.camera is not None and first.camera == second.camera:
         shared.append("intrinsics")

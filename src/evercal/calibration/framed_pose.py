@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.robot.mount import MountName, mount_named
-from evercal.typing import Array
+from evercal.typing import Array, JsonObject
 
 
 @frozen
@@ -161,7 +161,7 @@ class FramedPose:
             return self.for_lens("stated")
         return self
 
-    def transform_to_dict(self) -> dict[str, Any]:
+    def transform_to_dict(self) -> JsonObject:
         """Return JSON values of the transform."""
         return {
             "parent_frame": self.parent_frame,

@@ -9,7 +9,7 @@ with the grip if that has changed, see `held_thing.held_again`.
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -39,6 +39,7 @@ from evercal.geometry.rays import fit_rays
 from evercal.localization.intrinsics import STATED, cameras_in_scenes
 from evercal.recordings.images import pixels_of
 from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount, MountName, mount_named
+from evercal.typing import JsonObject
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
@@ -167,7 +168,7 @@ def _view(
 
 
 def _held_thing_calibration(
-    grip: HeldAgain, view: _View, camera: Camera, source: dict[str, Any]
+    grip: HeldAgain, view: _View, camera: Camera, source: JsonObject
 ) -> Calibration:
     """The calibration that was solved for together with another grip of the thing."""
     assert view.parent_from_scene is not None, "the gripper holds the scene"

@@ -13,7 +13,7 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.image_files import image_files
 from evercal.recordings.images import Picture, as_rgb
 from evercal.recordings.poses.pairing import poses_of_images
-from evercal.typing import PathLike
+from evercal.typing import PathLike, Strings
 
 ImageSource = PathLike | np.ndarray | Sequence[PathLike] | Sequence[np.ndarray]
 """A folder, an image file or an array (H, W, 3), or several files or arrays."""
@@ -29,7 +29,7 @@ class Images:
     """Intrinsics. None: those of the camera that recorded the scene, or of another of its model."""
     base_from_gripper: SE3 | None = None
     """(n,) gripper pose at each image."""
-    notes: tuple[str, ...] = ()
+    notes: Strings = ()
     """How poses and images were paired."""
 
     def __post_init__(self) -> None:

@@ -17,7 +17,6 @@ from evercal.geometry import (
     average_poses,
     deviations,
     length_mm_deg,
-    norms,
     pose_distance_mm_deg,
 )
 from evercal.geometry.rays import fit_rays
@@ -205,7 +204,7 @@ def fuse(located: Sequence[ImagePose]) -> Fused:
 
 
 def _far(off: Array) -> BoolArray:
-    distance = norms(off.reshape(-1, 2, 3))
+    distance = np.linalg.norm(off.reshape(-1, 2, 3), axis=2)
     # For three Gaussian axes the median distance is 1.54 standard deviations.
     spread = np.median(distance, axis=0) / 1.54
     return (

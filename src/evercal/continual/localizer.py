@@ -23,7 +23,7 @@ from evercal.localization.matching import strided_patches
 from evercal.localization.pnp import PnpOptions, PnpResult, solve_pnp, uncertain
 from evercal.localization.query import Encoded
 from evercal.recordings.images import as_rgb
-from evercal.typing import Image
+from evercal.typing import Image, Strings
 
 
 @frozen
@@ -71,7 +71,7 @@ class NetworkLocalizer:
             head.eval()
 
     @property
-    def scenes(self) -> tuple[str, ...]:
+    def scenes(self) -> Strings:
         """Names of the scenes, in order of learning."""
         return tuple(record.name for record in self.contents.scenes)
 

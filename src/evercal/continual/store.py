@@ -42,6 +42,7 @@ from evercal.storage.stages import (
     write_report,
 )
 from evercal.storage.tensors import load_tensors, save_tensors
+from evercal.typing import JsonObject, Strings
 
 HEAD = "head.safetensors"
 """File of the weights of a head."""
@@ -144,14 +145,14 @@ class NetworkStore(StageStore[LearnedScenes]):
         self.add(record.name, write, payload, lambda file: shared and file == HEAD)
         self.contents = scenes
 
-    def _write_networks(self, scenes: LearnedScenes) -> tuple[str, ...]:
+    def _write_networks(self, scenes: LearnedScenes) -> Strings:
         data = descriptor.descriptor_bytes(scenes.descriptor)
         name = f"descriptor-{hashlib.sha256(data).hexdigest()[:12]}.safetensors"
         write_bytes(self.root / name, data)
         return (*scenes.encoder.write(self.root), name)
 
 
-def describe(path: Path) -> tuple[list[dict[str, Any]], int, int, dict[str, int]]:
+def describe(path: Path) -> tuple[list[JsonObject], int, int, dict[str, int]]:
     """Scenes for JSON, working size, size of networks, and files with their sizes."""
     store = NetworkStore.open(path)
     contents = store.contents
@@ -209,7 +210,7 @@ def _tensors(path: Path) -> dict[str, Tensor]:
     return {name: torch.tensor(value) for name, value in load_tensors(path).items()}
 
 
-def _plain(record: SceneRecord) -> dict[str, Any]:
+def _plain(record: SceneRecord) -> JsonObject:
     """A record as in its file, without its prototypes."""
     content = {**vars(record), "cell": asdict(record.cell)}
     del content["prototypes"]

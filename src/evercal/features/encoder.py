@@ -22,7 +22,7 @@ from evercal.features.views import working_grey
 from evercal.features.vlad import Vlad, fit_centroids, unit
 from evercal.storage.atomic import naming_file, write_bytes
 from evercal.storage.tensors import load_tensors, save_tensors
-from evercal.typing import Array, Float32Array, Image
+from evercal.typing import Array, Float32Array, Image, JsonObject, Strings
 
 WEIGHTS = Path(__file__).parent / "weights"
 """Folder of the shipped networks and centroids."""
@@ -102,10 +102,10 @@ class Encoder:
             self._vlad = Vlad(self._centroids)
         return self._vlad
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> JsonObject:
         return self.__dict__ | {"_vlad": None}
 
-    def write(self, root: Path) -> tuple[str, ...]:
+    def write(self, root: Path) -> Strings:
         """Write the network, and centroids that are not shipped; return the names of the files."""
         shipped = False
         if self.data:

@@ -27,9 +27,9 @@ from evercal.geometry.distortion import (
     widest_fisheye,
     widest_pinhole,
 )
-from evercal.typing import Array
+from evercal.typing import Array, JsonObject, Strings
 
-COEFFICIENTS: dict[str, tuple[str, ...]] = {
+COEFFICIENTS: dict[str, Strings] = {
     "pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
@@ -307,7 +307,7 @@ class Camera:
     @classmethod
     def from_dict(cls, data: Mapping[str, object]) -> Self:
         """Inverse of `to_dict`; unknown keys are ignored, `distortion` is optional."""
-        numbers: dict[str, Any] = {}
+        numbers: JsonObject = {}
         for name in ("width", "height", "fx", "fy", "cx", "cy"):
             numbers[name] = _number(data.get(name), name)
         distortion = data.get("distortion", ())

@@ -311,7 +311,7 @@ def length_mm_deg(deviation: Array) -> tuple[float, float]:
     return 1000 * float(metres), float(np.rad2deg(radians))
 
 
-def norms(vectors: Array) -> Array:
+def norms(vectors: ArrayLike) -> Array:
     """Lengths (...) of vectors (..., k)."""
     return np.linalg.norm(vectors, axis=-1)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from evercal.errors import InputError
 from evercal.mapping.store import MapStore
 from evercal.recordings.frame import Recording
-from evercal.typing import PathLike
+from evercal.typing import PathLike, Strings
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
@@ -54,7 +54,7 @@ class LearnedScenes:
         return self._store.root
 
     @property
-    def scenes(self) -> tuple[str, ...]:
+    def scenes(self) -> Strings:
         """Names of the scenes, in order of learning."""
         return tuple(scene.name for scene in self._store.contents.scenes)
 

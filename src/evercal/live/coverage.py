@@ -13,7 +13,7 @@ from evercal.classes import frozen, frozen_arrays
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame
 from evercal.recordings.pictures import sharpness
-from evercal.typing import Array, Image
+from evercal.typing import Array, Image, Strings
 
 IMAGES = 25
 """Images of a complete recording."""
@@ -64,7 +64,7 @@ class SampleReport:
     """Relative to the median of the recording."""
     clipped: float
     """Share of black or white pixels."""
-    problems: tuple[str, ...]
+    problems: Strings
     """Reasons to remove it; empty for a good sample."""
 
 
@@ -89,7 +89,7 @@ class Coverage:
     """Of the camera or the gripper, along x, y and z of the base."""
     rotation_rank: int
     """Number of axes about which the rotations spread; calibration needs two."""
-    missing: tuple[str, ...]
+    missing: Strings
     """What to record, most urgent first."""
     ready: bool
     """Whether it can be learned: enough images and rotations about two axes."""
@@ -186,7 +186,7 @@ def _missing(
     rank: int,
     rotations: Sequence[AxisCoverage],
     positions: Sequence[AxisCoverage],
-) -> tuple[str, ...]:
+) -> Strings:
     missing = []
     if good < MIN_GRIPPER_FRAMES:
         missing.append(f"{MIN_GRIPPER_FRAMES - good} more images to start with")

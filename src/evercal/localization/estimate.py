@@ -8,6 +8,7 @@ import numpy as np
 from evercal.choices import Status
 from evercal.classes import frozen_arrays, html_table
 from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.typing import Strings
 
 Cause = Literal["view", "lens", "map", "stated poses", "base frame"]
 
@@ -55,7 +56,7 @@ class PoseEstimate:
     """Shares that sum to the covariance; empty without alignment."""
     alternatives: tuple[SE3, ...] = ()
     """The poses base_from_camera of an ambiguous image, the stronger one first."""
-    omitted: tuple[str, ...] = ()
+    omitted: Strings = ()
     """Steps that a time for the frame left out, see `TrackOptions.at_most_ms`."""
     parent_frame: str = "base"
     """gripper in the map of a thing that the gripper holds: the pose is then

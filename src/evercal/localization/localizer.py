@@ -32,7 +32,7 @@ from evercal.mapping.scene_map import MapContents
 from evercal.mapping.store import MapStore
 from evercal.processes import one_product_thread
 from evercal.recordings.images import as_rgb
-from evercal.typing import Image, IntArray, PathLike
+from evercal.typing import Image, IntArray, PathLike, Strings
 
 MIRRORED = 4.0
 """The mirror image is tried where a pose has less than this many times the required support."""
@@ -74,7 +74,7 @@ class Localizer:
         return restricted
 
     @property
-    def scenes(self) -> tuple[str, ...]:
+    def scenes(self) -> Strings:
         """Names of the scenes, in order of learning."""
         return tuple(scene.name for scene in self.contents.scenes)
 

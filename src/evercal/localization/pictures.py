@@ -8,13 +8,14 @@ from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.recordings.images import Picture, pixels_of
+from evercal.typing import Strings
 
 
 class SceneLocalizer(Protocol):
     """What locates images in scenes: a `Localizer`, or a stand-in with the same methods."""
 
     @property
-    def scenes(self) -> tuple[str, ...]:
+    def scenes(self) -> Strings:
         """Names of the scenes, in order of learning."""
         ...
 

@@ -13,7 +13,7 @@ from evercal.errors import InputError, is_plain
 from evercal.geometry import SE3, Camera
 from evercal.recordings.images import Picture, file_of, files_in, is_readable, pixels_of
 from evercal.storage.text_files import few
-from evercal.typing import Image
+from evercal.typing import Image, Strings
 
 if TYPE_CHECKING:
     from evercal.robot.arm import Arm
@@ -87,7 +87,7 @@ class Recording:
     """Number of recorded frames left out for lack of a valid pose."""
     base: str | None = None
     """Name of the base frame, if several scenes share it."""
-    notes: tuple[str, ...] = ()
+    notes: Strings = ()
     """Choices and omissions of the reader, one sentence each."""
     metric: bool = True
     """Whether lengths are metres; False where their unit is unknown, as in structure from motion.

@@ -18,7 +18,7 @@ from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.storage.atomic import naming_file, write_bytes
 from evercal.storage.text_files import named_errors, natural_key
-from evercal.typing import Image, PathLike
+from evercal.typing import Image, PathLike, Strings
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 """Endings of image files, in lower case."""
@@ -81,9 +81,7 @@ def file_of(image: Picture) -> Path | None:
     return None
 
 
-def files_in(
-    folder: Path, end: tuple[str, ...] = IMAGE_ENDINGS, glob: str = "*"
-) -> list[Path]:
+def files_in(folder: Path, end: Strings = IMAGE_ENDINGS, glob: str = "*") -> list[Path]:
     """Files in a folder with one of some endings, in lower case; image-2 comes before image-10.
 
     Hidden files, such as ._a.jpg that macOS puts beside a.jpg, are no content.

@@ -20,6 +20,7 @@ from evercal.recordings.frame import (
 from evercal.recordings.images import file_of
 from evercal.recordings.pictures import look_at
 from evercal.recordings.poses.pose_evidence import rotation_warnings
+from evercal.typing import Strings
 
 SAME_M = 0.001
 """Distance below which two poses are the same, metres."""
@@ -54,7 +55,7 @@ class Inspection:
     """Test frames with a pose."""
     untracked: int
     """Frames without a usable pose."""
-    cameras: tuple[str, ...]
+    cameras: Strings
     """One line for each set of intrinsics."""
     metric: bool
     """Whether lengths are in metres; else their unit is unknown."""
@@ -69,9 +70,9 @@ class Inspection:
     near_training: float | None = None
     """Per cent of test frames with a training frame within 5 cm and 5 deg; None without frames, or
     where the unit is unknown."""
-    notes: tuple[str, ...] = ()
+    notes: Strings = ()
     """Choices and omissions of the reader."""
-    warnings: tuple[str, ...] = ()
+    warnings: Strings = ()
     """What is implausible."""
 
 

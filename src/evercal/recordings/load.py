@@ -11,7 +11,7 @@ from evercal.errors import InputError
 from evercal.recordings.frame import Recording, with_images
 from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import named_errors
-from evercal.typing import PathLike
+from evercal.typing import PathLike, Strings
 
 
 @frozen
@@ -22,7 +22,7 @@ class RecordingFormat:
     """Module of `recordings.formats` with functions `detect` and `load`."""
     contents: str
     """Files that identify it, for messages."""
-    uses: tuple[str, ...] = ()
+    uses: Strings = ()
     """Fields of `ReadOptions` that its `load` takes, apart from `every`."""
 
     @property

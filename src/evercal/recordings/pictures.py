@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from evercal.recordings.frame import Frame
-from evercal.typing import Array, Image
+from evercal.typing import Array, Image, Strings
 
 _LOOKED_AT = 12
 """Number of images that are looked at, spread over a recording."""
@@ -29,7 +29,7 @@ _FLAT = 1.0
 class Pictures(NamedTuple):
     """What images show."""
 
-    warnings: tuple[str, ...]
+    warnings: Strings
     usable: bool
     """Whether a map can be learned from them."""
 

@@ -24,7 +24,7 @@ from evercal.reports.overlay import (
     resized,
 )
 from evercal.reports.scene import Surroundings
-from evercal.typing import Array, Image
+from evercal.typing import Array, Image, Strings
 
 if TYPE_CHECKING:
     from evercal.reports.inspected import LearnedLocalizer
@@ -65,7 +65,7 @@ class AnnotatedImages:
 
     images: Mapping[str, LandmarkPicture] = field(default_factory=dict)
     """At most `MAX_IMAGES`, by path; each summary begins with the use in the calibration."""
-    missing: tuple[str, ...] = ()
+    missing: Strings = ()
     """Sentences about overlays that are not possible."""
     other_map: bool = False
     """Whether the map in the store differs from the map of the calibration."""

@@ -37,6 +37,7 @@ from evercal.reports.scene import (
     readable_scale,
     view_panel,
 )
+from evercal.typing import Strings
 
 _VIEW_PX = (420, 400)
 """Width and height of a view from above or from the side."""
@@ -55,7 +56,7 @@ class CalibrationPage(NamedTuple):
     """A report."""
 
     html: str
-    missing: tuple[str, ...]
+    missing: Strings
     """Sentences about contents that the calibration does not provide."""
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from evercal.classes import frozen_arrays
 from evercal.geometry import SE3
-from evercal.typing import Array, BoolArray
+from evercal.typing import Array, BoolArray, Strings
 
 
 class MovingJoint(NamedTuple):
@@ -32,7 +32,7 @@ class MovingJoint(NamedTuple):
 class Arm:
     """Kinematics of an arm."""
 
-    joints: tuple[str, ...]
+    joints: Strings
     """Names of the k joint values, from the base outwards."""
     chain: tuple[MovingJoint, ...]
     """Joints that move, from the base to the gripper."""

@@ -3,7 +3,6 @@
 import json
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,6 +11,7 @@ from evercal.choices import ArmClass
 from evercal.errors import InputError
 from evercal.robot.arm import Arm, MovingJoint
 from evercal.robot.robot_model import RobotModel
+from evercal.typing import JsonObject
 
 _FILE = Path(__file__).with_name("arms.json")
 """Metres and degrees by the name of an arm.
@@ -23,7 +23,7 @@ the base frames that may be meant: on the floor, or where the first two axes mee
 _TOOLS_M = (0.0, 0.1, 0.2, 0.3)
 """Lengths of an unknown tool."""
 
-_ARMS: dict[str, Any] = json.loads(_FILE.read_text(encoding="utf-8"))
+_ARMS: JsonObject = json.loads(_FILE.read_text(encoding="utf-8"))
 ARM_NAMES: dict[str, ArmClass] = {name: arm["kind"] for name, arm in _ARMS.items()}
 """The known arms, and the class of each."""
 USUAL_RAD: dict[ArmClass, float] = {

@@ -10,6 +10,7 @@ import numpy as np
 from evercal.bounds import require_at_most
 from evercal.classes import frozen_arrays
 from evercal.storage.text_files import naming
+from evercal.typing import Strings
 
 _ENDS = (
     "name",
@@ -78,7 +79,7 @@ class Joint:
         return ""
 
 
-def parsed_urdf(data: bytes) -> tuple[tuple[str, ...], tuple[Joint, ...]]:
+def parsed_urdf(data: bytes) -> tuple[Strings, tuple[Joint, ...]]:
     """Names of links, and the joints, in the order of the file; all else is skipped.
 
     Raises:

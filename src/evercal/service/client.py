@@ -15,7 +15,7 @@ from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.recordings.images import as_rgb
 from evercal.robot.mount import MountName
-from evercal.typing import PathLike
+from evercal.typing import PathLike, Strings
 
 if TYPE_CHECKING:
     from evercal.calibration.drift import Shift
@@ -55,7 +55,7 @@ class Client:
         )
 
     @property
-    def scenes(self) -> tuple[str, ...]:
+    def scenes(self) -> Strings:
         """Names of the scenes, in order of learning."""
         return tuple(self._ask("GET", "/scenes")["scenes"])
 

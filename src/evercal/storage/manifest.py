@@ -11,20 +11,20 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
-from typing import Any, Self
+from typing import Self
 
 from evercal.bounds import require_at_most
 from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.storage.atomic import write_json
-from evercal.typing import PathLike
+from evercal.typing import JsonObject, PathLike
 
 MANIFEST = "manifest.json"
 _FORMAT = "evercal-manifest"
 _SCHEMA = 1
 """Version of the format of the manifest itself."""
 
-FileRecord = dict[str, Any]
+FileRecord = JsonObject
 """`sha256` and `bytes` of a file."""
 
 
@@ -38,7 +38,7 @@ def sha256_file(path: PathLike) -> str:
 class Manifest:
     """The content of a manifest."""
 
-    payload: dict[str, Any]
+    payload: JsonObject
     """Settings of the writer."""
     files: dict[str, FileRecord]
     """Checksum and size of every file when it was written, by relative path."""
@@ -123,7 +123,7 @@ def write_manifest(
     )
 
 
-def read_manifest(root: PathLike) -> dict[str, Any]:
+def read_manifest(root: PathLike) -> JsonObject:
     """The payload; files are not checked, see `verify`."""
     return Manifest.read(root).payload
 

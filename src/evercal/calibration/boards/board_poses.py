@@ -31,7 +31,7 @@ from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
-from evercal.typing import Array, PathLike
+from evercal.typing import Array, JsonObject, PathLike
 
 FORMAT = "evercal-board-poses"
 VERSION = 1
@@ -72,7 +72,7 @@ class BoardPoses:
         """Images that show the board."""
         return tuple(image for image in self.images if image.camera_from_board)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return the JSON values described at the top of this file."""
         return {
             "format": FORMAT,
@@ -165,8 +165,8 @@ def board_poses(
     )
 
 
-def _image_to_dict(image: BoardImage) -> dict[str, Any]:
-    record: dict[str, Any] = {
+def _image_to_dict(image: BoardImage) -> JsonObject:
+    record: JsonObject = {
         "name": image.name,
         "reason": image.reason,
         "rms_px": image.rms_px,

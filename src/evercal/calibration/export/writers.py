@@ -17,6 +17,7 @@ import yaml
 from evercal.calibration.export.request import Export, pose_numbers
 from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.typing import Strings
 
 _NUMBER_OF_OTHERS = re.compile(
     r"(?<=: )(\d+[eE][-+]?\d+|\d+\.\d*[eE]\d+|0o[0-7]+)$", re.MULTILINE
@@ -262,7 +263,7 @@ def zivid(export: Export) -> str:
     return _yaml(record, None)
 
 
-def _image_poses(export: Export) -> tuple[tuple[str, ...], SE3]:
+def _image_poses(export: Export) -> tuple[Strings, SE3]:
     robot = export.robot_poses
     if not export.in_hand:
         used = tuple(image.name for image in export.calibration.images if image.used)

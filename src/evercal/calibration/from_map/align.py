@@ -27,7 +27,7 @@ from evercal.mapping.map_frame import MapFrame, Similarity
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import Picture
 from evercal.storage.text_files import few
-from evercal.typing import Array, Image
+from evercal.typing import Array, Image, Strings
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
@@ -52,7 +52,7 @@ class MapAlignment:
     """Estimated pose of the camera on the gripper, or of the board that it holds."""
     sigma: tuple[float, float] = (0.0, 0.0)
     """Standard deviation per axis in the middle of the scene, millimetres and degrees."""
-    warnings: tuple[str, ...] = ()
+    warnings: Strings = ()
     """What the robot's motions contradict."""
 
     def applied_to(self, scene: SceneMap) -> SceneMap:
@@ -249,7 +249,7 @@ class Picks(NamedTuple):
     camera: Camera
     points: Array
     """(k, 3) in the base frame, metres."""
-    names: tuple[str, ...]
+    names: Strings
     pixels: Array
     """(k, 2)."""
 

@@ -36,6 +36,7 @@ from evercal.mapping.built_map import (
 )
 from evercal.recordings.frame import Frame, stated_grippers
 from evercal.robot.arm_offsets import ArmOffsets
+from evercal.typing import JsonObject, Strings
 
 MOST_POSE_SIGMA_MM = 5.0
 """A larger standard deviation of gripper positions indicates such errors, too; millimetres."""
@@ -58,7 +59,7 @@ class HandEye:
     given_mm: float | None = None
     """Distance from a given `gripper_from_camera`, such as from CAD."""
     given_deg: float | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: Strings = ()
     """Reasons not to rely on the estimate."""
     advice: str = ""
     """Images that would improve it most; empty if no direction of the position is open."""
@@ -68,7 +69,7 @@ class HandEye:
         """The transform with its covariance."""
         return self.calibration.uncertain_pose
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return JSON values, as `evercal learn --json` prints them."""
         calibration = self.calibration
         pose = calibration.parent_from_child
@@ -118,7 +119,7 @@ def hand_eye_of(
     built: BuiltMap,
     frames: Sequence[Frame],
     given: SE3 | None = None,
-    warnings: tuple[str, ...] = (),
+    warnings: Strings = (),
 ) -> HandEye:
     """Return the estimate of a map that was built from `frames` with `MapOptions.for_hand_eye`.
 
@@ -297,7 +298,7 @@ def _moved_mm(offsets: ArmOffsets, frames: Sequence[Frame]) -> list[float]:
     return [float(lengths.mean()), float(lengths.max())]
 
 
-def _warnings(adjusted: Adjusted) -> tuple[str, ...]:
+def _warnings(adjusted: Adjusted) -> Strings:
     warnings = []
     if abs(adjusted.focal_percent) > MOST_FOCAL_PERCENT:
         warnings.append(

@@ -9,7 +9,7 @@ from evercal.errors import InputError
 from evercal.geometry import length_mm_deg, norms
 from evercal.mapping.built_map import BuiltMap
 from evercal.recordings.frame import Frame
-from evercal.typing import Array
+from evercal.typing import Array, Strings
 
 SLIP_CHANCE = 1e-4
 """Largest probability of a step by chance."""
@@ -35,7 +35,7 @@ class Step(NamedTuple):
 
 def motion_warnings(
     frames: Sequence[Frame], built: BuiltMap, background: Array
-) -> tuple[str, ...]:
+) -> Strings:
     """Refuse a recording of a fixed camera in which the camera or the thing moved once.
 
     A thing that slips in the gripper steps in the gripper's residuals, a camera in its own. Where

@@ -26,7 +26,7 @@ from evercal.recordings.poses.row_files import (
     without_ending,
 )
 from evercal.storage.text_files import natural_key, read_json
-from evercal.typing import Array, BoolArray, IntArray
+from evercal.typing import Array, BoolArray, IntArray, Strings
 
 Inverted = Literal["robot", "camera", "both"]
 
@@ -50,7 +50,7 @@ class PairFiles:
 class _Poses:
     """The n poses of a table, or of a file of `evercal detect`."""
 
-    names: tuple[str, ...] | None
+    names: Strings | None
     stamps_s: Array | None
     """(n,) times from the file or from the names of images."""
     poses: SE3
@@ -60,7 +60,7 @@ class _Poses:
     numbers: PoseNumbers | None = None
     board: BoardPoses | None = None
 
-    def row_names(self) -> tuple[str, ...]:
+    def row_names(self) -> Strings:
         return self.names or tuple(f"row {i + 1}" for i in range(len(self.poses)))
 
     def corners_of(self, rows: IntArray) -> BoardCorners | None:
@@ -252,7 +252,7 @@ def _is_board_file(path: Path) -> bool:
 
 
 def _rows_by_name(
-    files: PairFiles, robot: tuple[str, ...], camera: tuple[str, ...]
+    files: PairFiles, robot: Strings, camera: Strings
 ) -> tuple[list[int | None], list[str]]:
     row_of = {without_ending(name): i for i, name in enumerate(robot)}
     for i, name in enumerate(robot):

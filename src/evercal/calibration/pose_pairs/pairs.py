@@ -6,7 +6,7 @@ corners say about them, and the derivative of each pose by them, come from `boar
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -31,7 +31,7 @@ from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, norms, pose_distance
 from evercal.recordings.poses.conventions import PoseConvention
 from evercal.robot.mount import MountName, mount_named
-from evercal.typing import Array, BoolArray, IntArray
+from evercal.typing import Array, BoolArray, IntArray, JsonObject, Strings
 
 _SAME_ROBOT_M = 1e-4
 """Distance below which two robot poses are equal."""
@@ -62,7 +62,7 @@ class PoseNumbers:
 class PosePairs:
     """n pose pairs; the board may be any object with camera poses: a tag, a map, an SfM model."""
 
-    names: tuple[str, ...]
+    names: Strings
     """(n,) names of images or rows."""
     base_from_gripper: SE3
     """(n,) poses from the robot."""
@@ -74,7 +74,7 @@ class PosePairs:
     """(n, 6) gripper velocity in the base frame, m/s and rad/s, to estimate a time offset."""
     robot_numbers: PoseNumbers | None = None
     camera_numbers: PoseNumbers | None = None
-    notes: tuple[str, ...] = ()
+    notes: Strings = ()
     """How robot and camera poses were paired."""
 
     def __post_init__(self) -> None:
@@ -92,7 +92,7 @@ class PosePairs:
 
     def __getitem__(self, index: IntArray | BoolArray) -> Self:
         rows = np.arange(len(self))[index]
-        changed: dict[str, Any] = {"names": tuple(self.names[row] for row in rows)}
+        changed: JsonObject = {"names": tuple(self.names[row] for row in rows)}
         for name, value in vars(self).items():
             if name not in ("names", "notes") and value is not None:
                 changed[name] = value[rows]
@@ -208,7 +208,7 @@ class BoardCorners:
     """Whether the intrinsics are stated by the maker; else they come from these corners."""
     size_m: float | None = None
     """Stated side of a square, or of a tag, for messages."""
-    left_out: tuple[str, ...] = ()
+    left_out: Strings = ()
     """Images and pixels of corners that leave their neighbours."""
 
     def turned(self, view: BoardView) -> list[BoardView]:

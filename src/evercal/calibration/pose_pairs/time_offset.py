@@ -18,7 +18,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.robot.mount import MountName
-from evercal.typing import Array, BoolArray
+from evercal.typing import Array, BoolArray, Strings
 
 _STEP_S = 0.01
 """Step of the grid of offsets."""
@@ -38,7 +38,7 @@ _MAX_CHANGE_S = 0.02
 class CameraTrack:
     """Board poses of images with time stamps."""
 
-    names: tuple[str, ...]
+    names: Strings
     stamps_s: Array
     """(n,) seconds of the camera clock."""
     camera_from_board: SE3

@@ -25,6 +25,7 @@ from evercal.errors import InputError
 from evercal.evaluation import metrics
 from evercal.storage import write_json
 from evercal.storage.settings import read_settings
+from evercal.typing import JsonObject
 
 Table = Any
 """A DataFrame of pandas, whose methods pyright cannot check without stubs."""
@@ -209,12 +210,12 @@ def record_environment(folder: Path) -> str:
     return key
 
 
-def read_environments(folder: Path) -> dict[str, Any]:
+def read_environments(folder: Path) -> JsonObject:
     """Read the records of a folder by key; empty without the file."""
     return read_records(folder / ENVIRONMENTS)
 
 
-def read_records(path: Path) -> dict[str, Any]:
+def read_records(path: Path) -> JsonObject:
     """Read records in JSON by key; empty without the file."""
     if not path.exists():
         return {}

@@ -19,14 +19,14 @@ from evercal.recordings import (
     stated_poses,
 )
 from evercal.recordings.samples import sample_rooms
-from evercal.typing import Array
+from evercal.typing import Array, Strings
 
 
 @frozen
 class Suite:
     """A named sequence of scenes."""
 
-    scenes: tuple[str, ...]
+    scenes: Strings
     """Names in order of learning; each is a folder of the data."""
     source: str
     """Where the recordings are from."""
@@ -51,7 +51,7 @@ _TWELVE = (
 """Four rooms of each kind."""
 
 
-def _rendered(name: str, scenes: tuple[str, ...] = _THREE) -> Suite:
+def _rendered(name: str, scenes: Strings = _THREE) -> Suite:
     return Suite(scenes, f"python -m rooms {name} --out DIR")
 
 

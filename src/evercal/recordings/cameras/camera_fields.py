@@ -16,7 +16,7 @@ from evercal.geometry.camera import COEFFICIENTS
 from evercal.recordings.cameras.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.poses.row_files import by_alias, is_number
 from evercal.storage.text_files import few
-from evercal.typing import Array
+from evercal.typing import Array, JsonObject
 
 Fields = Mapping[str, Any]
 """Values by name."""
@@ -111,7 +111,7 @@ def field_name(key: object) -> str:
     return _NAMES.get(plain, plain)
 
 
-def named_fields(data: Fields) -> dict[str, Any]:
+def named_fields(data: Fields) -> JsonObject:
     """Values by `field_name`; ValueError if two keys are the same field."""
     keys = {}
     fields = {}

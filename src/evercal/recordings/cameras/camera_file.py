@@ -23,7 +23,7 @@ from evercal.recordings.cameras.camera_fields import (
 from evercal.recordings.poses.array_files import arrays_as_lists
 from evercal.recordings.poses.row_files import is_number
 from evercal.storage.text_files import documents, few, named_errors, naming, read_text
-from evercal.typing import PathLike
+from evercal.typing import JsonObject, PathLike
 
 _OF_ONE_CAMERA = ("camera_matrix", "fx", "fy", "cx", "cy")
 """Fields that do not hold for the cameras inside an entry."""
@@ -92,9 +92,9 @@ def camera_from_fields(data: Fields, size: Size | None = None) -> Camera:
     )
 
 
-def _undotted(data: Fields) -> dict[str, Any]:
+def _undotted(data: Fields) -> JsonObject:
     """ORB-SLAM's `Camera1.fx` as an entry `Camera1`; `Camera.fps` holds for all cameras."""
-    groups: dict[str, dict[str, Any]] = {"": {}, "Camera": {}}
+    groups: dict[str, JsonObject] = {"": {}, "Camera": {}}
     for key, value in data.items():
         group, _, name = str(key).rpartition(".")
         if key == "Camera.type":
@@ -123,7 +123,7 @@ def _entries(data: Fields, around: Fields, name: str) -> Iterator[tuple[str, Fie
         yield from _entries(entry, inherited, inner)
 
 
-def _ungrouped(data: Fields) -> dict[str, Any]:
+def _ungrouped(data: Fields) -> JsonObject:
     """Fields such as `intrinsics: {fx: ...}` without that group."""
     fields = dict(data)
     for key, value in data.items():
@@ -182,7 +182,7 @@ def _centred(focal_px: float, width: int, height: int) -> list[float]:
     return [focal_px, 0.0, cx, 0.0, focal_px, cy, 0.0, 0.0, 1.0]
 
 
-def _of_xml(text: str) -> dict[str, Any]:
+def _of_xml(text: str) -> JsonObject:
     from xml.etree import ElementTree
 
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can expand without bound

@@ -13,7 +13,7 @@ import numpy as np
 
 from evercal.geometry import Camera
 from evercal.geometry.distortion import FISHEYE_DEG
-from evercal.typing import Array
+from evercal.typing import Array, Strings
 
 MAX_ERROR_PX = 0.5
 """Largest difference between a model and the fisheye that replaces it, pixels."""
@@ -22,7 +22,7 @@ MAX_ERROR_PX = 0.5
 class RadialModel(NamedTuple):
     """A model without other distortion."""
 
-    parameters: tuple[str, ...]
+    parameters: Strings
     """Names of the parameters of `radius`, in order."""
     radius: Callable[..., Array]
     """Image radius in focal lengths, of (n,) angles to the axis and parameters."""

@@ -27,7 +27,7 @@ from evercal.storage.text_files import (
     read_json,
     refuse_repeated,
 )
-from evercal.typing import PathLike
+from evercal.typing import JsonObject, PathLike, Strings
 
 FILE = "scene.json"
 """File that lists the frames."""
@@ -119,7 +119,7 @@ class SceneWriter:
 
     def __init__(self, root: PathLike, name: str, link: bool = False) -> None:
         self.untracked = 0
-        self.notes: tuple[str, ...] = ()
+        self.notes: Strings = ()
         self.metric = True
         self.render: dict[str, object] | None = None
         self._root = Path(root)
@@ -248,7 +248,7 @@ def _frame(
     camera = entry.get("camera")
     split = entry.get("split")
     image = path_inside(entry.get("image"), "'image'")
-    optional: dict[str, Any] = {}
+    optional: JsonObject = {}
     depth = entry.get("depth")
     if depth is not None:
         optional["depth"] = root / path_inside(depth, "'depth'")

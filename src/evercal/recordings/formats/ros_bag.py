@@ -43,7 +43,7 @@ from evercal.recordings.images import (
 from evercal.recordings.poses.pose_track import MAX_GAP_S
 from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import named_errors
-from evercal.typing import Image
+from evercal.typing import Image, JsonObject
 
 
 def _encodings(table: str) -> dict[str, tuple[int, int, str]]:
@@ -233,7 +233,7 @@ def _camera(message: Any, image_size: tuple[int, int], rectified: bool) -> Camer
         k = np.reshape(p, (3, 4))[:, :3].ravel().tolist()
         d = []
         model = ""
-    data: dict[str, Any] = {"k": k, "d": d, "distortion_model": model}
+    data: JsonObject = {"k": k, "d": d, "distortion_model": model}
     for name in ("width", "height", "binning_x", "binning_y"):
         data[name] = int(getattr(message, name))
     roi = message.roi

@@ -11,6 +11,7 @@ import numpy as np
 from evercal.bounds import require_at_most
 from evercal.processes import status_of
 from evercal.storage.text_files import library_errors
+from evercal.typing import JsonObject
 
 _READ = f"""
 import sys
@@ -49,7 +50,7 @@ def arrays_as_lists(path: Path) -> Any:
         return {key: loaded[key].tolist() for key in loaded.files}
 
 
-def matlab_arrays(file: IO[bytes]) -> dict[str, Any]:
+def matlab_arrays(file: IO[bytes]) -> JsonObject:
     """Arrays of numbers in a MATLAB file, by name."""
     from scipy.io import loadmat, whosmat
 

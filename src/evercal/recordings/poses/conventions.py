@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from difflib import get_close_matches
 from itertools import chain, product
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,7 +22,7 @@ from evercal.classes import frozen
 from evercal.geometry import norms
 from evercal.geometry.se3 import SE3
 from evercal.recordings.poses.row_files import by_alias
-from evercal.typing import Array, BoolArray
+from evercal.typing import Array, BoolArray, JsonObject
 
 _TOLERANCE = 1e-2
 """Error of a quaternion's length, or of R^T R, if printed with three digits."""
@@ -142,7 +141,7 @@ for _first, _second, _third in product("xyz", repeat=3):
             f"moving_{_axes}", _axes.upper(), f"{_meaning}, moving axes"
         )
         CONVENTIONS |= {_fixed.name: _fixed, _moving.name: _moving}
-UNITS: dict[str, dict[str, Any]] = {
+UNITS: dict[str, JsonObject] = {
     "m": {"metres_per_unit": 1.0},
     "mm": {"metres_per_unit": 0.001},
     "rad": {"degrees": False},

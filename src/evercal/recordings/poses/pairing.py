@@ -20,7 +20,7 @@ from evercal.storage.text_files import (
     natural_key,
     refuse_repeated,
 )
-from evercal.typing import Array
+from evercal.typing import Array, Strings
 
 Pairing = tuple[list[SE3 | None], list[str]]
 """The pose of each image, if it has one, and notes."""
@@ -154,7 +154,7 @@ def _by_name(
 
 
 def _rows_of_keys(
-    names: Sequence[tuple[str, ...]], keys: Sequence[str]
+    names: Sequence[Strings], keys: Sequence[str]
 ) -> tuple[list[int | None], list[str]]:
     """Number of the key that is one of each image's names, the last if several; unused keys."""
     unused = {key: number for number, key in enumerate(keys)}

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from evercal.bounds import bounds, require_at_most
 from evercal.recordings.images import IMAGE_ENDINGS
 from evercal.storage.text_files import named_errors, read_text
-from evercal.typing import Array
+from evercal.typing import Array, Strings
 
 Cells = NDArray[np.object_]
 """(n, k) str, each of its own length."""
-Names = tuple[str, ...] | None
+Names = Strings | None
 
 _NAMES = (
     "image",
@@ -71,7 +71,7 @@ class LabelledRows(NamedTuple):
     """(n,) image names, if there is such a column."""
     stamps_s: Array | None
     """(n,) seconds, if there is such a column."""
-    columns: tuple[str, ...]
+    columns: Strings
     values: Array
     """(n, columns) numbers of the other columns."""
 

@@ -22,6 +22,7 @@ from evercal.service.viewer.html import (
     position_mm,
     rows_html,
 )
+from evercal.typing import Strings
 
 _CAMERAS: dict[str, Which] = {"camera on the gripper": "wrist", "fixed camera": "fixed"}
 """Cameras by their labels."""
@@ -154,7 +155,7 @@ class Controls:
         self._keep(gui.add_html(""), content=lambda: self._coverage(which))
         sample: Any = gui.add_dropdown("Sample", ("-",))
 
-        def names() -> tuple[str, ...]:
+        def names() -> Strings:
             frames = reversed(studio.recorders[which].frames)
             return tuple(frame.name for frame in frames)
 

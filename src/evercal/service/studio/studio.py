@@ -29,6 +29,7 @@ from evercal.recordings.frame import stated_grippers
 from evercal.recordings.images import write_jpeg
 from evercal.service.studio.devices import Connection, Devices, Which
 from evercal.storage import sha256_file, write_json
+from evercal.typing import Strings
 
 FIXED_IMAGES = 8
 """Images of a series of the fixed camera."""
@@ -362,7 +363,7 @@ def _around(recorded: SE3, good: SE3, gripper_from_camera: SE3 | None) -> SE3:
     return there @ SE3.exp(turns) @ back @ start @ SE3.exp(closer) @ mount.inverse()
 
 
-def _free_name(name: str, taken: tuple[str, ...]) -> str:
+def _free_name(name: str, taken: Strings) -> str:
     free = name
     number = 2
     while free in taken:

@@ -16,7 +16,7 @@ from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.robot_model import RobotModel
-from evercal.typing import Array, BoolArray, IntArray
+from evercal.typing import Array, BoolArray, IntArray, Strings
 
 _BASES = (
     "base_link",
@@ -110,7 +110,7 @@ class _TfTree:
         transforms = edge.static if transform.stamp_s is None else edge.moving
         transforms.append(transform._replace(parent=parent, child=child))
 
-    def frames(self) -> tuple[str, ...]:
+    def frames(self) -> Strings:
         """All frames, parents before children."""
         frames = {*self._edges}
         for topics in self._edges.values():
