@@ -17,7 +17,7 @@ from evercal.choices import Status
 from evercal.classes import frozen
 from evercal.geometry import SE3
 from evercal.geometry.near import COARSE
-from evercal.typing import BoolArray
+from evercal.typing import BoolArray, JsonObject
 
 Thresholds = tuple[float, float]
 """Errors of position in metres and of rotation in radians, below which a pose is correct."""
@@ -96,7 +96,7 @@ class Scores:
     ms_per_image: float
     """Mean milliseconds per image, one at a time, decoding included."""
 
-    def to_dict(self) -> dict[str, object]:
+    def to_dict(self) -> JsonObject:
         """Convert to plain values for JSON; infinity and NaN become None."""
         values = dataclasses.asdict(self)
         values["scenes"] = {name: _plain(row) for name, row in self.scenes.items()}
@@ -120,7 +120,7 @@ class ContinualScores:
     accuracy_along: float
     """ACC: mean over all stages and the scenes learned by then (Diaz-Rodriguez et al. 2018)."""
 
-    def to_dict(self) -> dict[str, object]:
+    def to_dict(self) -> JsonObject:
         """Convert to plain values for JSON; NaN becomes None."""
         return _plain(self)
 
@@ -252,7 +252,7 @@ def _percent(flags: BoolArray) -> float:
     return 100.0 * int(flags.sum()) / len(flags)
 
 
-def _plain(record: SceneScores | ContinualScores) -> dict[str, object]:
+def _plain(record: SceneScores | ContinualScores) -> JsonObject:
     values = dataclasses.asdict(record)
     for key, value in values.items():
         if not math.isfinite(value):

@@ -296,9 +296,9 @@ class Camera:
         by_plane = np.moveaxis(by_plane, (0, 1), (-2, -1))
         return by_plane, np.moveaxis(lens, (0, 1), (-2, -1))
 
-    def to_dict(self) -> dict[str, object]:
+    def to_dict(self) -> JsonObject:
         """Plain numbers for JSON; the model only of a fisheye."""
-        values: dict[str, object] = asdict(self)
+        values: JsonObject = asdict(self)
         values["distortion"] = list(self.distortion)
         if self.model != "fisheye":
             del values["model"]

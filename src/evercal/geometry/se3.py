@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evercal.typing import Array
+from evercal.typing import Array, JsonObject
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -270,7 +270,7 @@ class SE3:
         return np.concatenate([velocity, vector], -1)
 
 
-def pose_to_dict(pose: SE3 | None) -> dict[str, object] | None:
+def pose_to_dict(pose: SE3 | None) -> JsonObject | None:
     """Single transform as plain numbers for JSON, metres and wxyz; None stays None."""
     if pose is None:
         return None

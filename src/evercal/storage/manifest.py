@@ -90,7 +90,7 @@ class Manifest:
 
 def write_manifest(
     root: PathLike,
-    payload: dict[str, object],
+    payload: JsonObject,
     files: Sequence[str],
     before: Manifest | None = None,
 ) -> None:

@@ -17,7 +17,7 @@ import yaml
 from evercal.calibration.export.request import Export, pose_numbers
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.typing import Strings
+from evercal.typing import JsonObject, Strings
 
 _NUMBER_OF_OTHERS = re.compile(
     r"(?<=: )(\d+[eE][-+]?\d+|\d+\.\d*[eE]\d+|0o[0-7]+)$", re.MULTILINE
@@ -202,7 +202,7 @@ def _handeye_frames(export: Export) -> dict[str, str]:
     }
 
 
-def _matrix(values: np.ndarray) -> dict[str, object]:
+def _matrix(values: np.ndarray) -> JsonObject:
     rows, columns = values.shape
     return {"rows": rows, "cols": columns, "data": values.ravel().tolist()}
 

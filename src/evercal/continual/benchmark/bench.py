@@ -39,6 +39,7 @@ from evercal.localization.options import LocalizeOptions
 from evercal.recordings import Recording
 from evercal.storage import sha256_file, write_json
 from evercal.storage.settings import lock_settings
+from evercal.typing import JsonObject
 
 ACCEPTANCE = (
     "CHANCE",
@@ -160,7 +161,7 @@ def in_order(scenes: Sequence[Recording], order: Order, seed: int) -> list[Recor
     return ordered
 
 
-def _settings(scenes: Sequence[Recording], options: BenchOptions) -> dict[str, object]:
+def _settings(scenes: Sequence[Recording], options: BenchOptions) -> JsonObject:
     stage = options.stage(0)
     stage = replace(stage, seed=0, encode=replace(stage.encode, seed=0))
     networks = (ENCODER_FILE, DESCRIBED_ENCODER, DESCRIPTOR_FILE)

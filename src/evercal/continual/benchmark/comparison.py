@@ -9,6 +9,7 @@ import pandas as pd
 from evercal.continual.benchmark.results import Table
 from evercal.errors import InputError
 from evercal.evaluation.metrics import ContinualScores, continual_scores
+from evercal.typing import JsonObject
 
 COARSE_COLUMN = "within_5cm_5deg"
 """Column of results.csv that counts frames within 5 cm and 5 deg."""
@@ -215,7 +216,7 @@ def formatted(table: Table) -> Table:
     return table.map("{:.1f}".format).where(table.notna(), "-")
 
 
-def summary(results: Table) -> dict[str, list[dict[str, object]]]:
+def summary(results: Table) -> dict[str, list[JsonObject]]:
     """Summarize every complete run for JSON, by strategy; NaN becomes None."""
     strategies = {}
     for name, seed, run in _runs(results):

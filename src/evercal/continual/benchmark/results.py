@@ -77,7 +77,7 @@ class StageResults:
     """Rows of frames.csv; empty before the last stage."""
 
 
-def scene_row(frames: Sequence[metrics.FrameResult]) -> dict[str, object]:
+def scene_row(frames: Sequence[metrics.FrameResult]) -> JsonObject:
     """Summarize the test frames of one scene: columns of results.csv that depend on them."""
     metres = np.array([frame.translation_error_m for frame in frames])
     radians = np.array([frame.rotation_error_rad for frame in frames])
@@ -102,7 +102,7 @@ def scene_row(frames: Sequence[metrics.FrameResult]) -> dict[str, object]:
     }
 
 
-def frame_row(frame: metrics.FrameResult) -> dict[str, object]:
+def frame_row(frame: metrics.FrameResult) -> JsonObject:
     """Columns of frames.csv that depend on the frame."""
     squared = frame.squared_mahalanobis
     if frame.wrong_scene:

@@ -16,7 +16,7 @@ from evercal.continual.networks.buffer import FeatureBuffer, Rows
 from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.selection.frame_statistics import FrameStatistics
-from evercal.typing import IntArray
+from evercal.typing import IntArray, JsonObject
 
 MethodState = Mapping[str, Tensor]
 """Named tensors that a method stores with a finished scene; they count as memory."""
@@ -99,10 +99,10 @@ class Isolation(Method):
     head_per_scene = True
 
 
-def described(record: object) -> dict[str, object]:
+def described(record: object) -> JsonObject:
     """Convert a dataclass to plain data: its class name as `kind`, and its fields."""
     assert is_dataclass(record)
-    plain: dict[str, object] = {"kind": type(record).__name__}
+    plain: JsonObject = {"kind": type(record).__name__}
     for field in fields(record):
         value = getattr(record, field.name)
         if is_dataclass(value):

@@ -136,7 +136,7 @@ def camera_of(data: Fields, size: Size | None) -> Camera:
         raise ValueError(
             f"the image is a cut-out (roi {roi}); give the whole image's camera_info"
         )
-    models: dict[str, object] = {}
+    models: JsonObject = {}
     for name in _MODEL_NAMES:
         if name in fields:
             models[_model_kind(fields[name])] = fields[name]

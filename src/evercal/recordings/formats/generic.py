@@ -121,12 +121,12 @@ class SceneWriter:
         self.untracked = 0
         self.notes: Strings = ()
         self.metric = True
-        self.render: dict[str, object] | None = None
+        self.render: JsonObject | None = None
         self._root = Path(root)
         self._name = name
         self._link = link
         self._cameras: dict[Camera, str] = {}
-        self._entries: dict[str, dict[str, object]] = {}
+        self._entries: dict[str, JsonObject] = {}
         if (self._root / FILE).exists():
             raise InputError(f"{self._root / FILE}: already there; give a new folder")
         (self._root / "images").mkdir(parents=True, exist_ok=True)
@@ -139,7 +139,7 @@ class SceneWriter:
         """Write scene.json unless an error was raised."""
         if kind is not None:
             return
-        data: dict[str, object] = {
+        data: JsonObject = {
             "format": _FORMAT,
             "version": _VERSION,
             "name": self._name,
@@ -166,7 +166,7 @@ class SceneWriter:
             )
         # The counter keeps names like 'a/b' and 'a_b' apart and the folder in recorded order.
         stem = f"{len(self._entries):06d}"
-        entry: dict[str, object] = {
+        entry: JsonObject = {
             "name": frame.name,
             "image": self._write_image(frame, f"images/{stem}"),
             "camera": self._cameras.setdefault(frame.camera, str(len(self._cameras))),
