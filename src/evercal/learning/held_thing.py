@@ -56,8 +56,8 @@ the thing may be small."""
 def learn_held_thing(
     recording: Recording,
     contents: MapContents,
-    on_progress: OnProgress = lambda *_: None,
-    errors: ArmErrors | None = None,
+    on_progress: OnProgress,
+    errors: ArmErrors | None,
 ) -> tuple[SceneMap, LearnReport]:
     """Map a thing in the frame of the gripper, and calibrate the fixed camera that observes it.
 

@@ -47,13 +47,13 @@ class Table:
     """Title of the table."""
 
     @classmethod
-    def of_records(cls, records: Sequence[Any], caption: str = "") -> Self:
+    def of_records(cls, records: Sequence[Any]) -> Self:
         """One row for each dataclass record, one column for each field."""
         header = [field.name.replace("_", " ") for field in fields(records[0])]
         rows = []
         for record in records:
             rows.append([_cell(name, value) for name, value in vars(record).items()])
-        return cls(header, rows, caption)
+        return cls(header, rows)
 
     @property
     def columns(self) -> list[int]:

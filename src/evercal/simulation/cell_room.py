@@ -43,7 +43,7 @@ _BOX_TEXTURE_PX = 128
 
 
 @lru_cache(maxsize=4)
-def cell_room(seed: int, boxes: int = 12) -> BoxRoom:
+def cell_room(seed: int) -> BoxRoom:
     """The room without the arm, in the base frame."""
     rng = default_rng([seed, 31])
     room = BoxRoom(seed, furniture=6, texture_px=_TEXTURE_PX)
@@ -53,7 +53,7 @@ def cell_room(seed: int, boxes: int = 12) -> BoxRoom:
     room.texture_px = _TABLE_TEXTURE_PX
     room.add_box(_TABLE_LOW_M, _TABLE_SIZE_M, rng)
     room.texture_px = _BOX_TEXTURE_PX
-    for _ in range(boxes):
+    for _ in range(12):
         size = rng.uniform((0.04, 0.04, 0.02), (0.14, 0.14, 0.16))
         aside = rng.uniform(-1, 1, 2) * (0.32, 0.42)
         centre = WORK_AREA_M[:2] + aside

@@ -116,7 +116,7 @@ def hand_eye_start(
     frames: Sequence[Frame],
     mount: Mount,
     encoder: Encoder,
-    on_progress: OnProgress = lambda *_: None,
+    on_progress: OnProgress,
     side: int = MATCHING_SIDE,
 ) -> HandEyeStart:
     """Estimate the transform of a camera from frames that all have `base_from_gripper`.

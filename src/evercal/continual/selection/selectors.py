@@ -69,16 +69,14 @@ def leverage_scores(features: Array, rank: int) -> Array:
     return (left[:, :used] ** 2).sum(1)
 
 
-def select_leverage(
-    features: Array, capacity: int, rng: Generator, rank: int = 32
-) -> IntArray:
+def select_leverage(features: Array, capacity: int, rng: Generator) -> IntArray:
     """Global-perspective data replay (GDR of FedCBDR, Qi et al., NeurIPS 2025) for one party.
 
     Frames are drawn without replacement, with probabilities proportional to their leverage.
     Encryption and bias weights, which serve several parties, are omitted.
     """
     # Frames without leverage can still fill the capacity.
-    scores = leverage_scores(features, rank) + 1e-12
+    scores = leverage_scores(features, rank=32) + 1e-12
     shares = scores / scores.sum()
     count = min(capacity, len(scores))
     return np.sort(rng.choice(len(scores), size=count, replace=False, p=shares))
