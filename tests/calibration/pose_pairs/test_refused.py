@@ -238,3 +238,14 @@ def test_a_misspelt_mount_is_refused() -> None:
     message = "^mount 'wrist': give eye_to_hand or eye_in_hand$"
     with pytest.raises(InputError, match=message):
         solve(pairs, mount)
+
+
+def test_mirrored_images_are_named() -> None:
+    truth = recording(replace(EXACT, path="table"), 0)
+    camera = truth.pairs.camera_from_board
+    mirror = np.diag([-1.0, 1.0, 1.0])
+    rotation = Rotation.from_matrix(mirror @ camera.rotation_matrix() @ mirror)
+    mirrored = pose(rotation, camera.translation_m @ mirror)
+    pairs = replace(truth.pairs, camera_from_board=mirrored)
+    with pytest.raises(InputError, match="only mirrored: switch the mirror"):
+        solve(pairs, "eye_in_hand")

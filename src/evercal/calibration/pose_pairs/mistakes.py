@@ -226,6 +226,11 @@ def _require_unit(
     free, scale = quick_fit(pairs, mount, False)
     if free.metres * _BETTER > fit.metres or free.radians > 1.5 * fit.radians + 1e-4:
         return
+    if scale < 0:
+        raise InputError(
+            "camera and robot agree only mirrored: switch the mirror of the camera off, or convert"
+            " the poses of a left-handed frame"
+        )
     message = (
         "the {} poses look like {}, the {}'s like metres; convert them, or state the unit with"
         " `{}_convention`"
