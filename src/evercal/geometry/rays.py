@@ -58,7 +58,7 @@ def fit_rays(own: Camera, other: Camera) -> RayFit:
     if rays.shape[1] < 3:
         raise ValueError("the distortion leaves no rays in the middle of the image")
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    turn, _ = Rotation.align_vectors(*rays)
+    turn = Rotation.align_vectors(*rays)[0]
     return RayFit(turn, rays[0], turn.apply(rays[1]))
 
 

@@ -11,9 +11,10 @@ from functools import partial
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError, require_numbers
 from evercal.features.encoder import Encoder
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, norms
 from evercal.mapping.arm_offsets import camera_in_gripper, joint_slopes, with_offsets
 from evercal.mapping.built_map import Adjusted, BuiltMap, HandEyeCorrection, of_rays
 from evercal.mapping.bundle_adjustment import BundleAdjustment
@@ -47,7 +48,7 @@ from evercal.recordings.frame import Frame, stated_grippers, stated_poses
 from evercal.robot.arm_offsets import ArmOffsets
 from evercal.robot.mount import Mount
 from evercal.robot.pose_errors import ArmErrors, shared_errors
-from evercal.typing import Array, IntArray
+from evercal.typing import Array, IntArray, Strings
 
 HAND_EYE_COVARIANCE_SCALE = 2.5
 """Factor on the covariance of `gripper_from_camera`. Alignment errors of a landmark are correlated
@@ -82,7 +83,7 @@ class MapOptions:
     """Rounds of tracking and adjusting; the second runs only if the first moved something."""
     arm: ArmOffsets | None = None
     """Joint offsets that the stated poses contain, in a hand-eye calibration; they are adjusted."""
-    confirmed: tuple[str, ...] = ()
+    confirmed: Strings = ()
     """Names of frames whose stated poses are known to agree with the images."""
     mount: Mount | None = None
     """Mount of a camera whose poses follow from those of a gripper; see `for_hand_eye`."""
@@ -153,16 +154,16 @@ def build_map(
     return built.take(options.memory.fitting(built.scene.keyframes))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class _Prepared:
     """Encoded frames whose stated poses are consistent with the images."""
 
     frames: PreparedFrames
     keyframes: list[int]
     """Numbers of the keyframes."""
-    wrong: tuple[str, ...]
+    wrong: Strings
     """Names of frames whose stated pose contradicts the images."""
-    untracked: tuple[str, ...]
+    untracked: Strings
     """Names of frames that could not be tracked."""
     unit: float | None
     """See `SceneMap.unit`."""
@@ -279,7 +280,7 @@ def _moved(
 ) -> bool:
     """Whether projections of landmarks moved noticeably, by poses or by intrinsics."""
     change = (stated.inverse() @ adjustment.poses).log().reshape(-1, 2, 3)
-    metres, radians = np.median(np.linalg.norm(change, axis=2), 0)
+    metres, radians = np.median(norms(change), 0)
     by_position = metres * np.median(adjustment.inverse_depth)
     by_camera = 0.0
     if adjustment.cameras is not None:
@@ -287,7 +288,7 @@ def _moved(
         down = np.linspace(0, camera.height - 1, 9)
         grid = np.stack(np.meshgrid(right, down), -1)
         shift = adjustment.cameras[0].project(camera.unproject(grid)) - grid
-        by_camera = float(np.nanmedian(np.linalg.norm(shift, axis=-1))) / camera.fx
+        by_camera = float(np.nanmedian(norms(shift))) / camera.fx
     return max(by_position, radians, by_camera) > NOTICEABLE_RAD
 
 

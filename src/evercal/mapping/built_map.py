@@ -1,18 +1,19 @@
 """`BuiltMap`: a scene's map, what was adjusted to build it, and what is needed to judge it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
 
-from evercal.geometry import SE3, Camera
+from evercal.classes import frozen, frozen_arrays
+from evercal.geometry import SE3, Camera, norms
 from evercal.mapping.arm_offsets import with_offsets
 from evercal.mapping.bundle_equations import DISTORTION, INTRINSICS, Adjustment
 from evercal.mapping.scene_map import LeftOut, SceneMap
 from evercal.recordings.frame import Frame
 from evercal.robot.arm_offsets import ArmOffsets
-from evercal.typing import Array, IntArray
+from evercal.typing import Array, IntArray, Strings
 
 GAP = 10
 """Cross-validation: frames without keyframes before and after a part that is left out. Frames
@@ -33,7 +34,7 @@ PART = 4
 """Frames between two that are left out, at least."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Adjusted:
     """What bundle adjustment changed about a recording, as JSON values."""
 
@@ -60,11 +61,11 @@ class Adjusted:
     """The same for the stated rotations, degrees."""
     time_shift_frames: float = 0.0
     """Delay of the images after their stated poses."""
-    wrong_poses: tuple[str, ...] = ()
+    wrong_poses: Strings = ()
     """Frames whose stated pose contradicts the images; they are excluded."""
-    untracked: tuple[str, ...] = ()
+    untracked: Strings = ()
     """Frames that could not be tracked in other images, or not enough; they are excluded."""
-    doubtful_poses: tuple[str, ...] = ()
+    doubtful_poses: Strings = ()
     """Frames whose stated pose has an unusually large error; they were given less weight."""
     corner_px: float = 0.0
     """Largest change of a corner of the first frame's image by the intrinsics, pixels."""
@@ -87,9 +88,7 @@ class Adjusted:
         size = (stated.width, stated.height)
         unit_square = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
         corners = unit_square * size - 0.5
-        moved = np.linalg.norm(
-            camera.project(stated.unproject(corners)) - corners, axis=-1
-        )
+        moved = norms(camera.project(stated.unproject(corners)) - corners)
         return cls(
             common_translation_mm=tuple((1000 * tangent[:3]).tolist()),
             common_rotation_deg=tuple(np.rad2deg(tangent[3:]).tolist()),
@@ -143,7 +142,7 @@ def of_rays(
     return by_noise, by_lens, rays @ adjustment.lens_systematic @ rays.T
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class HandEyeCorrection:
     """Adjustment of a rough `gripper_from_camera`."""
 
@@ -168,7 +167,7 @@ class HandEyeCorrection:
         return self.by_noise + self.by_lens + self.by_drift
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class BuiltMap:
     """A scene's map and how it came about."""
 
@@ -176,7 +175,7 @@ class BuiltMap:
     """What is stored."""
     adjusted: Adjusted
     """Changes by bundle adjustment, for reports."""
-    keyframe_names: tuple[str, ...]
+    keyframe_names: Strings
     """Names of the frames that are keyframes."""
     hand_eye: HandEyeCorrection | None = None
     """Adjustment of `gripper_from_camera`; None where camera poses were stated."""

@@ -13,13 +13,14 @@ dense normal equations with six rows a frame: 8 (6 n + 15)^2 bytes, and time in 
 `MapOptions.support_frames` bounds n; 350 frames take 36 MB.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, norms
 from evercal.mapping.bundle_equations import (
     COMMON,
     INTRINSICS,
@@ -71,7 +72,7 @@ CONVERGED = 1e-9
 than this share."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Estimate:
     """Parameters, their linearisation, and the factor of their covariance."""
 
@@ -312,7 +313,7 @@ class BundleAdjustment:
         parameters = estimate.parameters
         linearised = estimate.linearised
         residual = np.linalg.solve(tracks.whitening, linearised.residual[..., None])
-        residual_px = np.linalg.norm(residual[linearised.valid, :, 0], axis=1)
+        residual_px = norms(residual[linearised.valid, :, 0])
         cameras = None
         if self.adjusts_camera:
             cameras = self.frames.cameras(parameters)

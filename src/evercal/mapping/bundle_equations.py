@@ -1,12 +1,13 @@
 """Residuals of bundle adjustment, their derivatives, and the normal equations of one step."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import lapack
 from scipy.spatial.transform import Rotation
 
+from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, cross_matrix
 from evercal.typing import Array, BoolArray, IntArray
 
@@ -28,7 +29,7 @@ MIN_DISTORTION = 1e-4
 """Smaller changes of all distortion coefficients are ignored."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class BundleTracks:
     """Landmarks and their observations."""
 
@@ -55,7 +56,7 @@ class BundleTracks:
         return self.host[self.landmark]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Parameters:
     """Everything that bundle adjustment estimates."""
 
@@ -67,7 +68,7 @@ class Parameters:
     """(p,) per metre."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Linearised:
     """Whitened residuals of m observations and their derivatives.
 
@@ -203,7 +204,7 @@ class StatedFrames:
         return groups
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Solution:
     """One step."""
 
@@ -228,7 +229,7 @@ class HostBlock(NamedTuple):
     """(a, b) normal equations between inverse depths and parameters."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class NormalEquations:
     """Least squares in corrections and shared parameters (6 n + 15 + k) and inverse depths (p)."""
 
@@ -296,7 +297,7 @@ class NormalEquations:
             blocks,
             depth,
             slope,
-            depth_slope.astype(np.float64),
+            depth_slope.astype(float),
         )
 
     def solve(self, damping: float) -> Solution | None:
@@ -333,7 +334,7 @@ class NormalEquations:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Adjustment:
     """Result of bundle adjustment."""
 

@@ -1,9 +1,10 @@
 """`BundleOptions`: priors and weights of a bundle adjustment."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from evercal.classes import frozen
 from evercal.errors import require_numbers
 from evercal.geometry import Camera
 from evercal.geometry.distortion import USUAL_DISTORTION
@@ -21,7 +22,7 @@ _LEAST = 1e-12
 """Smallest value of the other numbers, which are divisors."""
 
 
-@dataclass(frozen=True)
+@frozen
 class BundleOptions:
     """Priors and weights of a bundle adjustment."""
 

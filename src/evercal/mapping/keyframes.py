@@ -6,13 +6,13 @@ image in milliseconds. A map adds depths, landmarks and a descriptor to each.
 """
 
 from collections.abc import Callable, Mapping, Sequence, Sized
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.features.views import working_image
 from evercal.geometry import SE3, Camera
@@ -44,7 +44,7 @@ _STORED = {
 """Type of the numbers of each stored array, and shape of its rows."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Keyframes:
     """The stored frames of one scene."""
 
@@ -189,7 +189,7 @@ class Keyframes:
                 tensors["landmark_counts"][:],
                 stored,
                 lambda part: Landmarks(
-                    *(field[part].astype(np.float64) for field in stored)
+                    *(field[part].astype(float) for field in stored)
                 ),
             )
         images = tensors["images"]

@@ -1,11 +1,11 @@
 """Landmarks: textured pixels of a keyframe with depth, slant and uncertainty."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.geometry.camera import Camera
 from evercal.typing import Array, Image, IntArray
 
@@ -23,7 +23,7 @@ _MAX_AREA = 5.0
 """Largest area of a warped patch."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Landmarks:
     """The landmarks of one keyframe."""
 
@@ -163,4 +163,4 @@ def slopes(
         scale=1 / 8,
     )
     pixels = np.stack([right, down], -1).reshape(-1, 2)
-    return pixels.astype(np.float64) / cell_px
+    return pixels.astype(float) / cell_px

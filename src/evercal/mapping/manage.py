@@ -7,13 +7,14 @@ last complete state.
 import hashlib
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import partial
 from pathlib import Path
 from typing import get_args
 
 from evercal.bounds import bounds
 from evercal.choices import OnClash
+from evercal.classes import frozen, frozen_arrays
 from evercal.errors import InputError
 from evercal.features.encoder import read_network
 from evercal.mapping.scene_map import MapContents, SceneMap
@@ -36,24 +37,24 @@ from evercal.storage.stages import (
     read_store,
 )
 from evercal.storage.text_files import read_json
-from evercal.typing import PathLike
+from evercal.typing import PathLike, Strings
 
 
-@dataclass(frozen=True)
+@frozen
 class Merged:
     """Outcome of a merge: names of scenes in the map that was merged into."""
 
-    added: tuple[str, ...]
+    added: Strings
     """New scenes, in order."""
     renamed: tuple[tuple[str, str], ...]
     """Name in the other map and new name of each scene whose name was taken."""
-    skipped: tuple[str, ...]
+    skipped: Strings
     """Scenes that were left out because their names were taken."""
-    replaced: tuple[str, ...]
+    replaced: Strings
     """Scenes that gave way to one of the same name."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class _Incoming:
     """A scene of another map."""
 
@@ -63,7 +64,7 @@ class _Incoming:
     scene: SceneMap
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class _Merge:
     """Scenes of a map while others are added."""
 

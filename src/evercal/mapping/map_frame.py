@@ -11,11 +11,12 @@ the map's frame and not of single frames, so localization undoes them:
 Slow corrections are predicted from neighbouring frames. Noise cannot be predicted and remains.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
-from evercal.geometry import SE3, UncertainPose
+from evercal.classes import frozen_arrays
+from evercal.geometry import SE3, UncertainPose, norms
 from evercal.typing import Array
 
 RADII = ((0.1, 10.0), (0.2, 15.0), (0.4, 25.0))
@@ -30,7 +31,7 @@ SHRINKAGE = 0.3
 """A zero correction counts as this many neighbours."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class FrameCorrection:
     """Slowly varying corrections of the stated poses."""
 
@@ -47,7 +48,7 @@ class FrameCorrection:
         return (weight[:, None] * self.correction).sum(0) / (weight.sum() + SHRINKAGE)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Similarity:
     """Transform from a map with a frame and scale of its own to the robot's base frame."""
 
@@ -73,7 +74,7 @@ class Similarity:
         return self.base_from_map.apply(self.scale * points)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class MapFrame:
     """Relation of a map's own frame to the robot's base frame."""
 
@@ -245,7 +246,7 @@ def _closeness(
     radius: tuple[float, float],
 ) -> Array:
     """(n,) Gaussian weights of poses by their distance to one pose."""
-    metres = np.linalg.norm(poses.translation_m - pose.translation_m, axis=-1)
+    metres = norms(poses.translation_m - pose.translation_m)
     cosine = np.abs(poses.rotation_wxyz @ pose.rotation_wxyz).clip(0, 1)
     angle = 2 * np.arccos(cosine)
     far = metres / radius[0]

@@ -2,11 +2,11 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evercal.classes import frozen
 from evercal.errors import InputError, require_numbers
 from evercal.mapping.selection import spread_poses
 from evercal.recordings.frame import Frame
@@ -32,7 +32,7 @@ _SAMPLED_FRAMES = 8
 """Frames whose size as keyframes is measured, for a budget in bytes."""
 
 
-@dataclass(frozen=True)
+@frozen
 class MemoryBudget:
     """Memory of one scene."""
 

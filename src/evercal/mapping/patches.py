@@ -190,7 +190,7 @@ def align_down(
             affines,
             iterations,
         )
-        pixels = from_level(pixels.astype(np.float64), level)
+        pixels = from_level(pixels.astype(float), level)
     return pixels, correlation
 
 
@@ -213,7 +213,7 @@ def whitening(
         shift_px: (n, 2) one standard deviation of an error along a line, such as the epipolar
             line of a landmark with an uncertain depth.
     """
-    spread = (affines @ inverse_hessian @ affines.transpose(0, 2, 1)).astype(np.float64)
+    spread = (affines @ inverse_hessian @ affines.transpose(0, 2, 1)).astype(float)
     variance = noise**2
     a = variance * (spread[:, 0, 0] + floor_px**2)
     b = variance * spread[:, 0, 1]

@@ -5,12 +5,12 @@ space-sweep approach, CVPR 1996).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.classes import frozen_arrays
 from evercal.features.views import ideal_cell_pixels
 from evercal.geometry import SE3, Camera
 from evercal.typing import Array, BoolArray, Float32Array
@@ -37,7 +37,7 @@ OUTLIER_PX = 4.0
 """Residuals beyond this have little weight in the refinement."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class PosedCells:
     """The encoded cells of a plain view."""
 
@@ -192,7 +192,7 @@ class _SourceView:
 
     def normal_equation(self, inverse: Array) -> tuple[Array, Array]:
         """Gradient and Hessian (cells,) of least squares in the inverse depth of each cell."""
-        rho = inverse.astype(np.float64)
+        rho = inverse.astype(float)
         u, v, front = self.pixels(rho)
         here = np.stack([u, v], 1)
         u, v, _ = self.pixels(rho + DEPTH_STEP)

@@ -9,16 +9,16 @@ an essential matrix decide: they confirm the pose, contradict it, or cannot trac
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from evercal.classes import frozen_arrays
 from evercal.features.sift import SiftFeatures, epipolar_rays, sift_features
 from evercal.features.views import cell_centres, ideal_cell_pixels
 from evercal.features.vlad import similar_pairs
-from evercal.geometry import Camera
+from evercal.geometry import Camera, norms
 from evercal.mapping.plane_sweep import FAR_M, NEAR_M, USUAL_M
 from evercal.mapping.prepared_frames import PreparedFrames
 from evercal.typing import Array, BoolArray, IntArray
@@ -48,7 +48,7 @@ STRIDE = 3
 """Step between the cells of the first frame that are matched."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class MatchedPair:
     """Two similar frames and their matches, without distortion."""
 
@@ -61,7 +61,7 @@ class MatchedPair:
     """(n, 2) in the second, at working size."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class PoseCheck:
     """Frames that are not used."""
 
@@ -214,7 +214,7 @@ def _matched(
     rows = rows[distinct]
     pixels = ideal_cell_pixels(camera, stride)[rows * STRIDE]
     ray = camera.pinhole.unproject(pixels)
-    matched = ideal_cell_pixels(other, stride)[best[rows]].astype(np.float64)
+    matched = ideal_cell_pixels(other, stride)[best[rows]].astype(float)
     # Near the edge, the distortion can have no ray for a cell.
     valid = np.isfinite(ray).all(1) & np.isfinite(matched).all(1)
     return MatchedPair(
@@ -254,8 +254,8 @@ def _triangulated(recording: PreparedFrames, pair: MatchedPair) -> Array:
     along = translation[:2] - plane * translation[2]
     squares = (along**2).sum(1)
     inverse = -(off * along).sum(1) / np.maximum(squares, 1e-18)
-    moved = inverse * np.linalg.norm(along, axis=1)
-    beside = np.linalg.norm(off + along * inverse[:, None], axis=1)
+    moved = inverse * norms(along)
+    beside = norms(off + along * inverse[:, None])
     clear = moved * camera.fx > MIN_PARALLAX_PX
     epipolar = beside * camera.fx < MAX_EPIPOLAR_PX
     return 1 / inverse[clear & epipolar]
@@ -276,4 +276,4 @@ def _segment_distance(
     along = end - start
     length = np.maximum((along**2).sum(1), 1e-12)
     share = (((points - start) * along).sum(1) / length).clip(0, 1)
-    return np.linalg.norm(points - start - share[:, None] * along, axis=1)
+    return norms(points - start - share[:, None] * along)

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evercal.classes import frozen
 from evercal.errors import require_numbers
 from evercal.features.encoder import Encoder
 from evercal.features.views import working_image
@@ -17,14 +18,14 @@ from evercal.mapping.patches import image_pyramid
 from evercal.mapping.plane_sweep import USUAL_M, PosedCells, inverse_depths
 from evercal.processes import cores
 from evercal.recordings.frame import Frame, stated_poses
-from evercal.typing import Array, Float32Array, Image, IntArray
+from evercal.typing import Array, Float32Array, Image, IntArray, Strings
 
 PYRAMID_LEVELS = 3
 _PYRAMIDS = 16
 """Image pyramids in memory for each thread, at most; a keyframe is aligned in 12 frames."""
 
 
-@dataclass(frozen=True)
+@frozen
 class WorkingSize:
     """Sizes that images are resized to, pixels of the shorter side."""
 
@@ -103,7 +104,7 @@ class PreparedFrames:
         """(n,) base_from_camera as the recording states them."""
         return stated_poses(self.frames)
 
-    def names(self, index: IntArray) -> tuple[str, ...]:
+    def names(self, index: IntArray) -> Strings:
         """Names of the frames of an index."""
         return tuple(self.frames[i].name for i in index)
 

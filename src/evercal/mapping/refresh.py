@@ -6,13 +6,14 @@ same. Keyframes that remain keep their poses: they tie the map to what did not m
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
+from evercal.classes import frozen, frozen_arrays
 from evercal.errors import require_numbers
 from evercal.features.encoder import Encoder
-from evercal.geometry import SE3, average_poses
+from evercal.geometry import SE3, average_poses, norms
 from evercal.mapping.bundle_adjustment import BundleAdjustment
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.bundle_tracks import bundle_tracks
@@ -38,7 +39,7 @@ from evercal.recordings.frame import Frame
 from evercal.typing import Array, BoolArray, IntArray
 
 
-@dataclass(frozen=True)
+@frozen
 class RefreshOptions:
     """Options of a refresh."""
 
@@ -74,7 +75,7 @@ class RefreshOptions:
         require_numbers(self, ("least_surviving", "most_novel"), 0, 1)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Refreshed:
     """A refreshed scene and what changed."""
 
@@ -148,7 +149,7 @@ def refreshed(
     )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class _Survival:
     """The landmarks of a keyframe after new images were compared."""
 
@@ -173,7 +174,7 @@ def _reopened(
     return KeyframeTracks(
         frame=i,
         landmarks=landmarks,
-        cell_inverse_depth=old.inverse_depth[i].astype(np.float64),
+        cell_inverse_depth=old.inverse_depth[i].astype(float),
         patches=template_patches(prepared, i, landmarks.pixels),
         sources=(),
         confirmed=np.ones(len(landmarks), bool),
@@ -199,7 +200,7 @@ def _survival(
         # The camera of image j in the frame of the keyframe's camera.
         centre = -rotation.T @ translation
         rays = points - centre
-        lengths = np.linalg.norm(rays, axis=1) * np.linalg.norm(points, axis=1)
+        lengths = norms(rays) * norms(points)
         similar = visible[(rays * points).sum(1) > least * lengths]
         if len(similar):
             expected[similar] += 1

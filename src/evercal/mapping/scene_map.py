@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
 from evercal.geometry import Camera
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from evercal.recordings.frame import Frame
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class SceneMap:
     """The map of one scene."""
 

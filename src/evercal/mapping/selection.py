@@ -19,16 +19,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from evercal.classes import frozen
 from evercal.errors import require_numbers
 from evercal.geometry.se3 import SE3
 from evercal.typing import Array, IntArray
 
 
-@dataclass(frozen=True)
+@frozen
 class SarsOptions:
     """When SARS rejects a pose as redundant."""
 
@@ -48,7 +48,7 @@ class SarsOptions:
         require_numbers(self, ("radius", "rotation_weight"), 0)
 
 
-@dataclass(frozen=True)
+@frozen
 class PoseSpace:
     """The poses of one scene, scaled for the metric and stored one component per row."""
 
@@ -71,8 +71,8 @@ class PoseSpace:
         Raises:
             ValueError: A wrong shape, a number that is not finite, or a zero quaternion.
         """
-        positions = np.asarray(positions_m, dtype=np.float64)
-        quaternions = np.asarray(quaternions_wxyz, dtype=np.float64)
+        positions = np.asarray(positions_m, float)
+        quaternions = np.asarray(quaternions_wxyz, float)
         if positions.shape[1:] != (3,) or quaternions.shape != (len(positions), 4):
             raise ValueError(
                 f"poses are (n, 3) and (n, 4), got {positions.shape} and {quaternions.shape}"
@@ -136,7 +136,7 @@ def _accept_until_full(
         later = gap[frame + 1 :]
         np.minimum(later, space.distances(frame, slice(frame + 1, None)), out=later)
         frame += 1
-    return np.array(accepted, dtype=np.int64)
+    return np.array(accepted, np.int64)
 
 
 def spread_poses(poses: SE3, capacity: int) -> IntArray:

@@ -5,10 +5,11 @@ the likelihood of any other prior follows in closed form, without another adjust
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from evercal.classes import frozen_arrays
 from evercal.robot.pose_errors import (
     FIRST_SHARED,
     WANTED,
@@ -24,7 +25,7 @@ _LEAST_INFORMATION = 1e-9
 """Lower bound of what the images say, as a share of the most in any direction."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class _Seen:
     """What the images say about n errors of stated poses, and how these vary beforehand."""
 

@@ -4,11 +4,12 @@ A correction of a pose is what the parameters common to all frames explain, and 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
-from evercal.geometry import SE3
+from evercal.classes import frozen_arrays
+from evercal.geometry import SE3, norms
 from evercal.mapping.bundle_equations import (
     COMMON,
     INTRINSICS,
@@ -24,7 +25,7 @@ LONG_STEP = 4
 """A gap of the recording is a step longer than this many median ones."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Variances:
     """Priors of a bundle adjustment."""
 
@@ -71,7 +72,7 @@ class StatedErrors:
         self.gripper_from_camera = gripper_from_camera or SE3.identity((self.n,))
         self.lever = self.gripper_from_camera.adjoint()
         self.joints = joints or JointSlopes(
-            np.zeros((self.n, 6, 0)), np.zeros(0, dtype=bool), np.zeros(0)
+            np.zeros((self.n, 6, 0)), np.zeros(0, bool), np.zeros(0)
         )
         by_joints = np.linalg.solve(self.lever, self.joints.slopes)
         by_common = np.tile(np.eye(6), (self.n, 1, 1))
@@ -153,7 +154,7 @@ def velocity_of(poses: SE3) -> Array:
     if len(poses) < 3:
         return velocity
     steps = (poses[:-1].inverse() @ poses[1:]).log()
-    size = np.linalg.norm(steps, axis=1)
+    size = norms(steps)
     smooth = size < LONG_STEP * np.median(size) + 1e-9
     mean = (steps[:-1] + steps[1:]) / 2
     velocity[1:-1] = np.where(

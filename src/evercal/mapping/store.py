@@ -44,6 +44,7 @@ from evercal.storage.stages import (
 )
 from evercal.storage.tensors import load_tensors, open_tensors, save_tensors
 from evercal.storage.text_files import named_errors, refuse_repeated
+from evercal.typing import JsonObject
 
 KIND = "map"
 """Kind of store in its manifest."""
@@ -203,10 +204,10 @@ class MapStore(StageStore[MapContents]):
         }
 
 
-def stored_scenes(root: Path) -> list[tuple[str, Camera, dict[str, Any]]]:
+def stored_scenes(root: Path) -> list[tuple[str, Camera, JsonObject]]:
     """Name, adjusted camera and report of every scene of a map; the encoder is not read."""
 
-    def read(manifest: Manifest) -> list[tuple[str, Camera, dict[str, Any]]]:
+    def read(manifest: Manifest) -> list[tuple[str, Camera, JsonObject]]:
         stored = []
         scenes = read_scenes(root, manifest)
         for scene, stage in zip(scenes, manifest.payload["stages"], strict=True):
@@ -217,7 +218,7 @@ def stored_scenes(root: Path) -> list[tuple[str, Camera, dict[str, Any]]]:
     return read_store(root, read)
 
 
-def require_map(root: Path, manifest: Manifest) -> dict[str, Any]:
+def require_map(root: Path, manifest: Manifest) -> JsonObject:
     """The payload of a map's manifest."""
     payload = manifest.payload
     if payload.get("kind") != KIND:
@@ -263,7 +264,7 @@ def write_scene(folder: Path, scene: SceneMap) -> None:
         save_tensors(folder / CORRECTION, correction_tensors(scene.frame.correction))
 
 
-def refreshes(folder: Path) -> list[dict[str, Any]]:
+def refreshes(folder: Path) -> list[JsonObject]:
     """Reports of the refreshes of a scene, oldest first."""
     file = folder / REFRESHES
     return json.loads(file.read_bytes())["refreshes"] if file.exists() else []
@@ -344,7 +345,7 @@ def frame_of(
     base = content["base_from_map"]
     covariance = content["base_covariance"]
     if covariance is not None:
-        covariance = np.asarray(covariance, np.float64)
+        covariance = np.asarray(covariance, float)
     similarity = None
     if base is not None:
         metric = bool(content.get("unit_known", True))
@@ -376,7 +377,7 @@ def correction_tensors(correction: FrameCorrection) -> dict[str, NDArray[Any]]:
     return {
         "poses": np.concatenate(rows, -1),
         "correction": np.asarray(correction.correction),
-        "radius": np.asarray(correction.radius, np.float64),
+        "radius": np.asarray(correction.radius, float),
     }
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evercal.geometry import norms
 from evercal.mapping.keyframes import Keyframes, jpeg
 from evercal.mapping.landmarks import Landmarks, detect, project_surface, slopes
 from evercal.mapping.patches import (
@@ -90,7 +91,7 @@ def open_keyframe(
     """Landmarks of a keyframe, with depths from a plane sweep over at most `others` frames."""
     view = recording.posed_cells(frame)
     swept, _ = recording.swept(frame, others)
-    inverse = swept.astype(np.float64)
+    inverse = swept.astype(float)
     near = recording.source_views(1 / inverse, view, others)
     cell_px = recording.cell_px(frame)
     pixels, cells = detect(recording.grey[frame], view.grid, cell_px)
@@ -192,7 +193,7 @@ def observe(
         steps,
     )
     good = correlation > MIN_CORRELATION
-    good &= np.linalg.norm(pixels - expected, axis=1) < reach_px
+    good &= norms(pixels - expected) < reach_px
     last = steps[-1][0]
     spread = templates[last].inverse_hessian[good]
     white = (

@@ -173,8 +173,10 @@ def prepare_export(
 def _for_lens(calibration: FramedPose, lens: Camera | PathLike | None) -> FramedPose:
     if lens is None:
         return calibration.for_program()
-    if isinstance(lens, Camera) or lens in ("stated", "estimated"):
+    if isinstance(lens, Camera):
         return calibration.for_lens(lens)
+    if lens in ("stated", "estimated"):
+        return calibration.for_lens(str(lens))
     own = calibration.camera
     return calibration.for_lens(read_camera(lens, own and (own.width, own.height)))
 

@@ -18,7 +18,7 @@ from evercal.calibration.pose_pairs.fit import (
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation, Unknowns
 from evercal.errors import InputError
-from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
+from evercal.geometry import SE3, norms, pose_distance, pose_distance_mm_deg
 from evercal.recordings.poses.pairing import counted
 from evercal.storage.text_files import few
 from evercal.typing import IntArray
@@ -134,7 +134,7 @@ def require_two_lists(pairs: PosePairs) -> None:
 
 
 def _median_length(poses: SE3) -> float:
-    return float(np.median(np.linalg.norm(poses.translation_m, axis=1)))
+    return float(np.median(norms(poses.translation_m)))
 
 
 def require_rotations(
@@ -182,7 +182,7 @@ def _require_metres(
     poses: SE3,
     role: str,
 ) -> None:
-    distance = np.linalg.norm(poses.translation_m, axis=1)
+    distance = norms(poses.translation_m)
     far = distance > _MAX_DISTANCE_M
     if not far.any():
         return
@@ -207,7 +207,7 @@ def _require_motion(pairs: PosePairs, scale_known: bool) -> None:
     """Refuse stale poses: one side stands still while the other moves."""
     unit = 1.0
     if not scale_known:
-        size = np.linalg.norm(pairs.camera_from_board.translation_m, axis=1)
+        size = norms(pairs.camera_from_board.translation_m)
         unit = max(float(np.median(size)), 1e-12)
     robot_still = _is_still(pairs.base_from_gripper, 1.0)
     camera_still = _is_still(pairs.camera_from_board, unit)
@@ -245,7 +245,7 @@ def held_out_error(
         at = _refined(equation, fit, rows[~held_out])
         every, _ = predicted(equation[rows], at, fit.levels, ~held_out)
         residual = every[held_out].reshape(-1, 2, 3)
-        lengths.append(np.linalg.norm(residual, axis=2))
+        lengths.append(norms(residual))
     error = np.concatenate(lengths) * (1000.0, 180 / np.pi)
     median_mm, median_deg = np.median(error, 0).tolist()
     rms_mm, rms_deg = np.sqrt((error**2).mean(0)).tolist()
@@ -284,7 +284,7 @@ def _refined(
     fit: HandEyeFit,
     rows: IntArray,
 ) -> Unknowns:
-    use = np.zeros(len(equation), dtype=bool)
+    use = np.zeros(len(equation), bool)
     use[rows] = True
     return refine(equation, fit.at, fit.levels, use)
 

@@ -1,6 +1,6 @@
 """Robust joint estimate of all unknowns of the hand-eye equation, and its covariance."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2, f
@@ -17,6 +17,8 @@ from evercal.calibration.pose_pairs.noise_levels import (
     slope_of,
 )
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation, System, Unknowns
+from evercal.classes import frozen, frozen_arrays
+from evercal.geometry import norms
 from evercal.geometry.normal_equations import normal_solution
 from evercal.typing import Array, BoolArray
 
@@ -40,7 +42,7 @@ KINDS = ("translation", "rotation about gripper", "depth", "rotation about board
 """Kinds of noise: two of an arm, and two of a camera unless corners tell its noise."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class HandEyeFit:
     """The refined estimate."""
 
@@ -69,7 +71,7 @@ class HandEyeFit:
         return np.sqrt(np.diag(self.covariance))
 
 
-@dataclass(frozen=True)
+@frozen
 class Agreement:
     """A quick robust estimate and its residuals."""
 
@@ -92,7 +94,7 @@ def agreement(equation: PoseEquation, start: Unknowns) -> Agreement:
     distance2 = np.zeros(n)
     for _ in range(_MAX_STEPS):
         system = equation.system(at)
-        lengths = np.linalg.norm(system.residual.reshape(n, 2, 3), axis=2)
+        lengths = norms(system.residual.reshape(n, 2, 3))
         sigma = np.maximum(np.median(lengths, 0) * to_sigma, 1e-8)
         distance2 = ((lengths / sigma) ** 2).sum(1)
         weight = (_STUDENT_FREEDOM + 6) / (_STUDENT_FREEDOM + distance2)
@@ -124,7 +126,7 @@ def robust_fit(
     least = max(MIN_POSES, n // 2, min(_FEW, int(np.ceil(2 * n / 3))))
     # Outliers cannot be detected; all poses widen the covariance.
     if inliers.sum() < least:
-        inliers = np.ones(n, dtype=bool)
+        inliers = np.ones(n, bool)
     for _ in range(_MAX_ROUNDS):
         levels = estimate_levels(_judges(equation, inliers).system(at), levels)
         at = refine(equation, at, levels, inliers)

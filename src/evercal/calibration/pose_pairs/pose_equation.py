@@ -9,18 +9,19 @@ Residuals are (translation, rotation vector) in the frame `fixed`, metres and ra
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from dataclasses import field, replace
+from typing import Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, cross_matrix
 from evercal.robot.pose_errors import SharedErrors
-from evercal.typing import Array, BoolArray, IntArray
+from evercal.typing import Array, BoolArray, IntArray, JsonObject, Strings
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Unknowns:
     """X = `parent_from_camera`, Z = `fixed_from_board`, and the extras."""
 
@@ -56,13 +57,13 @@ class Unknowns:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class Extras:
     """q further unknowns with a Gaussian prior; groups of them are independent."""
 
-    names: tuple[str, ...]
+    names: Strings
     """(q,)."""
-    groups: tuple[str, ...]
+    groups: Strings
     """(q,) `intrinsics`, `shared depth`, `size` or `clock`."""
     slopes: Array
     """(n, 6, q) derivatives of `camera_from_board`; zero for a time offset."""
@@ -113,7 +114,7 @@ class Extras:
         return replace(self, information=information)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class System:
     """The linear system of n poses at an estimate."""
 
@@ -133,7 +134,7 @@ class System:
     """(12 + q,) difference of the estimate from the mean of the prior."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class PoseEquation:
     """The n poses of one recording as plain arrays."""
 
@@ -157,7 +158,7 @@ class PoseEquation:
     """Kinds of errors of gripper poses that they share, by name."""
 
     def __getitem__(self, index: IntArray | BoolArray) -> Self:
-        changed: dict[str, Any] = {}
+        changed: JsonObject = {}
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
                 changed[name] = value[index]

@@ -13,6 +13,7 @@ from scipy.stats import f
 from evercal.calibration.pose_pairs.fit import HandEyeFit
 from evercal.calibration.pose_pairs.noise_levels import Noise, clipped_inverse
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
+from evercal.geometry import norms
 from evercal.typing import Array, BoolArray, IntArray
 
 _MIN_POSES = 2
@@ -79,7 +80,7 @@ def find_slip(
         equation,
         fit,
         order,
-        np.ones(len(order), dtype=bool),
+        np.ones(len(order), bool),
     )
     steps += _steps(
         equation,
@@ -101,7 +102,7 @@ def find_slip(
     what = "camera or board"
     if abs(freedom * np.log(camera.cost / board.cost)) > _CLEARLY:
         what = step.what
-    metres, radians = np.linalg.norm(step.change[-6:].reshape(2, 3), axis=1)
+    metres, radians = norms(step.change[-6:].reshape(2, 3))
     second = np.outer(step.change, step.change) + step.covariance
     before = np.eye(equation.unknowns, len(step.change))
     after = before.copy()

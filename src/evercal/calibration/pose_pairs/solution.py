@@ -1,8 +1,7 @@
 """`PairSolution`: a fit of pose pairs, and the calibration made of it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,9 +23,10 @@ from evercal.calibration.pose_pairs.pairs import (
 )
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation
 from evercal.calibration.verdict import verdict
-from evercal.geometry import SE3, Camera, length_mm_deg, pose_to_dict
+from evercal.classes import frozen_arrays
+from evercal.geometry import SE3, Camera, length_mm_deg, norms, pose_to_dict
 from evercal.robot.mount import MountName, mount_named
-from evercal.typing import Array, IntArray
+from evercal.typing import Array, IntArray, JsonObject, Strings
 
 _CAUSES = {
     "translation": "position of robot and camera poses",
@@ -56,7 +56,7 @@ def _origin(kind: str) -> str:
     return "lens" if kind == "intrinsics" else "images"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class PairSolution:
     """A fit and its pose pairs."""
 
@@ -72,7 +72,7 @@ class PairSolution:
     mount: MountName
     scale: float
     """Metres per unit of the camera's lengths."""
-    warnings: tuple[str, ...]
+    warnings: Strings
     corners: BoardCorners | None = None
     lens: Measured | None = None
 
@@ -143,17 +143,17 @@ class PairSolution:
     def _checks(
         self,
         time_offset_s: float | None,
-    ) -> dict[str, Any]:
+    ) -> JsonObject:
         fit = self.fit
         names = self.pairs.names
         residuals = fit.residual[fit.inliers].reshape(-1, 2, 3)
         rms = np.sqrt((residuals**2).sum(2).mean(0))
-        distance = np.linalg.norm(self.equation.camera_translation[fit.inliers], axis=1)
-        moved = 1000 * np.linalg.norm(fit.moved[:, :3], axis=1)
+        distance = norms(self.equation.camera_translation[fit.inliers])
+        moved = 1000 * norms(fit.moved[:, :3])
         rows = zip(self.rows, self.camera_from_board, strict=True)
         boards = {names[i]: pose_to_dict(pose) for i, pose in rows}
         scene = mount_named(self.mount).scene
-        checks: dict[str, Any] = {
+        checks: JsonObject = {
             "poses_given": len(self.pairs),
             "poses_used": int(fit.inliers.sum()),
             "residual_mm": 1000 * float(rms[0]),

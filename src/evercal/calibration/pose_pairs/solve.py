@@ -1,7 +1,7 @@
 """`solve`: estimate a calibration with uncertainty, checks and verdict from pose pairs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -38,8 +38,9 @@ from evercal.calibration.pose_pairs.second_group import second_group
 from evercal.calibration.pose_pairs.slips import Slip, find_slip
 from evercal.calibration.pose_pairs.solution import PairSolution
 from evercal.calibration.pose_pairs.starts import quick_fit
+from evercal.classes import frozen_arrays
 from evercal.errors import InputError
-from evercal.geometry import SE3, cross_matrix, pose_distance
+from evercal.geometry import SE3, cross_matrix, norms, pose_distance
 from evercal.robot.mount import MountName, mount_named
 from evercal.robot.pose_errors import WANTED, ArmErrors, shared_errors
 from evercal.typing import BoolArray, IntArray
@@ -213,7 +214,7 @@ def _slip_warning(
     )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_arrays
 class _Problem:
     """What is known of the pairs besides their poses."""
 
@@ -236,7 +237,7 @@ class _Problem:
         shifts = start.translations.copy()
         shifts[1] += start.rotations[1] @ middle_of(self.corners)
         at = replace(start, translations=shifts)
-        accepted = np.ones(len(pairs), dtype=bool)
+        accepted = np.ones(len(pairs), bool)
         with_shift = False
         for remaining in reversed(range(_MAX_LENSES)):
             equation = self.equation(pairs, lens, accepted)[rows]
@@ -307,7 +308,7 @@ class _Problem:
 
 def _mount_warnings(at: Unknowns, mount: MountName) -> list[str]:
     """The other mount with inverted robot poses obeys the same equation."""
-    camera, board = np.linalg.norm(at.translations, axis=1).tolist()
+    camera, board = norms(at.translations).tolist()
     mounted = mount_named(mount)
     carried = board
     if mounted.moves:
