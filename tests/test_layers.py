@@ -53,9 +53,9 @@ FOR_ALL = (
 FACES = ("__init__", "__main__")
 """Modules of the root that may import everything."""
 PRODUCT = ORDER[: ORDER.index("simulation")]
-MOST_LOCALIZING = 59
+MOST_LOCALIZING = 61
 """Modules of evercal that a program loads for localizing, at most."""
-MOST_LEARNING = 93
+MOST_LEARNING = 94
 """The same for learning."""
 
 

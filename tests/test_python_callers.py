@@ -113,7 +113,7 @@ WRONG: dict[str, tuple[Callable[[Map], object], str]] = {
     ),
     "a camera on the gripper to check": (
         lambda cell: cell.check(
-            IMAGE, Calibration("eye_in_hand", SE3.identity(), np.eye(6), "gripper")
+            IMAGE, Calibration("eye_in_hand", SE3.identity(), np.eye(6))
         ),
         "the reference is a camera on the gripper",
     ),

@@ -18,6 +18,9 @@ from evercal.calibration.checks import checks_of
 from evercal.calibration.verdict import TIERS, expected_error, tier, verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, cross_matrix, pose_distance
+from evercal.robot.frame_names import FrameNames
+
+SAME = {"gripper": "panda_hand", "camera": "panda_hand"}
 
 
 def example() -> Calibration:
@@ -25,8 +28,7 @@ def example() -> Calibration:
         "eye_in_hand",
         SE3.exp([0.1, -0.2, 0.3, 0.4, -0.5, 0.6]),
         np.diag([1e-6, 1e-6, 4e-6, 1e-8, 1e-8, 4e-8]),
-        "panda_hand",
-        "camera_color_optical_frame",
+        FrameNames("base", "panda_hand", "camera_color_optical_frame"),
         Camera(640, 480, 600, 601, 320, 240),
         (ImageUse("a.png", True, "", 0.5, 0.1), ImageUse("b.png", False, "blurred")),
         (ErrorTerm("map", 0.3, 0.01),),
@@ -77,7 +79,10 @@ def test_sigmas_are_root_mean_squares_over_the_axes() -> None:
         ({"covariance": [[1]]}, "covariance"),
         ({"covariance": (-np.eye(6)).tolist()}, "negative eigenvalue"),
         ({"images": [{"nam": 1}]}, "wrong kind"),
-        ({"child_frame": "panda_hand"}, "both called"),
+        ({"child_frame": "panda_hand"}, "'frames' names other frames"),
+        ({"child_frame": "panda_hand", "frames": SAME}, "both called"),
+        ({"frames": {"base": 1}}, "names of frames are texts"),
+        ({"frames": {"tool": "tcp"}}, "wrong kind"),
         ({"source": 5}, "'source' is an object"),
         ({"joint_covariance": []}, "the covariance of 2 joints is"),
         ({"joints": [{"name": "lift"}]}, "wrong kind"),
@@ -111,7 +116,6 @@ def calibration(mm: float, deg: float, **checks: float) -> Calibration:
         "eye_in_hand",
         SE3.identity(),
         np.diag(axes**2),
-        "gripper",
         checks=checks_of(checks),
     )
 

@@ -14,6 +14,7 @@ from evercal.calibration.export.formats import export_files
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg
 from evercal.recordings.cameras.camera_file import read_camera
+from evercal.robot.frame_names import FrameNames
 
 STATED = Camera(1280, 720, 900, 903, 650, 362, (0.01, 0.2, 4e-4, -4e-4, -0.3))
 ESTIMATED = STATED.changed([0.002, 6, -3, 0.01, -0.02, 3e-4, -2e-4, 0.02])
@@ -21,10 +22,13 @@ POSE = SE3.exp([0.05, -0.03, 0.02, 0.4, -0.5, 0.6])
 SIGMA = np.repeat([0.4e-3, np.deg2rad(0.03)], 3)
 
 
+NAMES = FrameNames(gripper="hand", camera="right")
+
+
 def example(pose: SE3 = POSE, camera: Camera | None = ESTIMATED) -> Calibration:
     lenses = {"stated": STATED, "estimated": ESTIMATED}
     return Calibration(
-        "eye_in_hand", pose, np.diag(SIGMA**2), "gripper", camera=camera, lenses=lenses
+        "eye_in_hand", pose, np.diag(SIGMA**2), NAMES, camera=camera, lenses=lenses
     )
 
 
@@ -123,8 +127,8 @@ def vars_of(calibration: Calibration) -> dict[str, object]:
     ("change", "message"),
     [
         ({"mount": "eye_to_hand"}, "mount is 'eye_in_hand' in the first"),
-        ({"parent_frame": "tool0"}, "parent_frame is 'gripper' in the first"),
-        ({"child_frame": "left"}, "child_frame is 'camera' in the first"),
+        ({"frames": FrameNames(gripper="tool0")}, "gripper is 'hand' in the first"),
+        ({"frames": FrameNames(camera="left")}, "camera is 'right' in the first"),
         ({"camera": STATED.resized(640, 360)}, "differ in image size"),
     ],
 )

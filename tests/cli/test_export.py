@@ -22,6 +22,7 @@ from evercal.calibration.export.request import (
 from evercal.errors import with_options
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.poses.robot_poses import read_robot_poses
+from evercal.robot.frame_names import FrameNames
 from evercal.robot.mount import MountName
 
 POSE = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
@@ -30,11 +31,16 @@ POSE = SE3.exp([0.9, -0.1, 0.5, -1.5, 0.6, 0.4])
 @pytest.fixture
 def make(tmp_path) -> Any:
     def write(mount: MountName = "eye_to_hand", child: str = "camera") -> Path:
-        parent = "base" if mount == "eye_to_hand" else "gripper"
         camera = Camera(640, 480, 600, 601, 320, 240)
         images = (ImageUse("1.png", True),)
         calibration = Calibration(
-            mount, POSE, 1e-8 * np.eye(6), parent, child, camera, images, verdict="good"
+            mount,
+            POSE,
+            1e-8 * np.eye(6),
+            FrameNames(camera=child),
+            camera,
+            images,
+            verdict="good",
         )
         calibration.write(tmp_path / "calibration.json")
         return tmp_path / "calibration.json"

@@ -193,7 +193,7 @@ def folder(tmp_path, hall, monkeypatch) -> Path:
     Calibration("eye_to_hand", pose, spread, camera=camera, images=images).write(
         "c.json"
     )
-    Calibration("eye_in_hand", pose, spread, "gripper").write("hand.json")
+    Calibration("eye_in_hand", pose, spread).write("hand.json")
     return tmp_path
 
 

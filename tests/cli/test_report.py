@@ -77,7 +77,7 @@ def test_json_with_an_older_calibration(run, calibration, tmp_path):
     [(None, "no intrinsics"), (CAMERA, "names no images; pass some")],
 )
 def test_calibration_without_images_or_camera(run, tmp_path, camera, message):
-    own = Calibration("eye_in_hand", POSE, 1e-4 * np.eye(6), "gripper", camera=camera)
+    own = Calibration("eye_in_hand", POSE, 1e-4 * np.eye(6), camera=camera)
     own.write(tmp_path / "s.json")
     ran = run("report", tmp_path / "s.json", "--out", tmp_path / "r.html", "--json")
     assert ran.code == 0

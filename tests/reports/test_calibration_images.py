@@ -25,6 +25,7 @@ from evercal.reports.calibration_images import (
     select_images,
 )
 from evercal.reports.overlay import LandmarkPicture
+from evercal.robot.frame_names import FrameNames
 
 
 def pose(quaternion: ArrayLike, translation: ArrayLike) -> SE3:
@@ -166,7 +167,9 @@ def test_residuals_refer_to_the_calibration_of_a_fixed_camera(
     tmp_path: Path, mount: str, median_px: float
 ) -> None:
     write_images(tmp_path, "a.png")
-    own = calibration({"a.png": True}, mount=mount, parent_frame="parent")
+    own = calibration(
+        {"a.png": True}, mount=mount, frames=FrameNames("parent", "parent")
+    )
     localizer: Any = FixedLocalizer(BASE_FROM_CAMERA @ SE3.exp([0.05, 0, 0, 0, 0, 0]))
     [image] = drawn_in(own, tmp_path, localizer)
     assert image.landmarks == 2

@@ -27,6 +27,7 @@ from evercal.reports.calibration_page import (
 )
 from evercal.reports.overlay import LandmarkPicture
 from evercal.reports.scene import Surroundings, ellipse
+from evercal.robot.frame_names import FrameNames
 
 from .html_reader import HtmlReader
 
@@ -46,8 +47,7 @@ def full(**changes: Any) -> Calibration:
         "eye_to_hand",
         POSE,
         np.diag([1e-8, 4e-8, 9e-8, 1e-10, 1e-10, 4e-10]),
-        "panda_link0",
-        "camera_optical",
+        FrameNames("panda_link0", camera="camera_optical"),
         CAMERA,
         (
             ImageUse("shots/a.png", True, "", 0.51, 0.012),
@@ -86,7 +86,7 @@ def full(**changes: Any) -> Calibration:
 def solved() -> Calibration:
     """A calibration without images and intrinsics."""
     return Calibration(
-        "eye_in_hand", POSE, 1e-6 * np.eye(6), "gripper", source={"command": "solve"}
+        "eye_in_hand", POSE, 1e-6 * np.eye(6), source={"command": "solve"}
     )
 
 
@@ -235,8 +235,7 @@ def test_verdict_without_any_measure_has_no_basis() -> None:
 
 def test_all_strings_are_escaped() -> None:
     calibration = full(
-        parent_frame=MARKUP,
-        child_frame="c" + MARKUP,
+        frames=FrameNames(gripper=MARKUP, camera="c" + MARKUP),
         images=(ImageUse(MARKUP, False, MARKUP, 1.0, 1.0),),
         error_terms=(ErrorTerm(MARKUP, 1.0, 1.0),),
         checks=checks_of({MARKUP: MARKUP}),
@@ -339,7 +338,7 @@ def test_difference_between_calibrations() -> None:
     assert "differs by 5.00 mm and 0.000 deg from old.json" in reader.text("p")
     assert "-3.00 and -4.00 mm along x, y and z of panda_link0" in reader.text("p")
     assert "use the same map" in reader.text("p")
-    reader, _ = read(full(), older=replace(older, parent_frame="base", source={}))
+    reader, _ = read(full(), older=replace(older, frames=FrameNames("base"), source={}))
     assert "names its parent frame base" in reader.text("p")
     assert "use different maps" in reader.text("p")
     with pytest.raises(

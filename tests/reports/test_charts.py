@@ -13,6 +13,7 @@ from evercal.geometry import SE3, Camera
 from evercal.reports.charts import INKS, Panel, Shape, paint, rgb, write
 from evercal.reports.page import environment
 from evercal.reports.scene import Axes, Frustum, Surroundings, view_panel
+from evercal.robot.frame_names import FrameNames
 
 from .html_reader import HtmlReader
 
@@ -195,7 +196,9 @@ def test_charts_in_a_browser_keep_their_words_inside(
 
     file = tmp_path / "page.html"
     frame = "a_parent_frame_with_a_long_name"
-    file.write_text(read(full(parent_frame=frame))[1].html, encoding="utf-8")
+    file.write_text(
+        read(full(frames=FrameNames(frame, camera="camera")))[1].html, encoding="utf-8"
+    )
     colours = []
     for scheme in ("light", "dark"):
         visit = browser.new_page(

@@ -74,7 +74,6 @@ def calibration(scene: str) -> Calibration:
         "eye_in_hand",
         pose,
         1e-6 * np.eye(6),
-        "gripper",
         source={"scene": scene, "frames": 1},
     )
 

@@ -57,9 +57,8 @@ def page_of(localizer: Localizer, *given: Any) -> Iterator[Page]:
 def calibration(
     mount: Literal["eye_in_hand", "eye_to_hand"], **more: Any
 ) -> Calibration:
-    parent = "gripper" if mount == "eye_in_hand" else "base"
     return Calibration(
-        mount, HAND, np.diag([1e-6, 4e-6, 9e-6, 1e-8, 1e-8, 1e-8]), parent, **more
+        mount, HAND, np.diag([1e-6, 4e-6, 9e-6, 1e-8, 1e-8, 1e-8]), **more
     )
 
 

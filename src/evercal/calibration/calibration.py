@@ -2,6 +2,7 @@
 
     {"format": "evercal-calibration", "version": 1, "mount": "eye_to_hand",
      "parent_frame": "base", "child_frame": "camera",
+     "frames": {"base": "", "gripper": "", "camera": ""},
      "meaning": "pose of camera in base: takes points from camera to base",
      "translation_m": [3], "quaternion_wxyz": [4], "matrix": [4][4],
      "covariance": [6][6], "sigma_mm": x, "sigma_deg": x, "camera": {...},
@@ -12,7 +13,8 @@
 
 Metres, radians, quaternions w, x, y, z, OpenCV camera axes. The pose belongs to `camera`, which is
 the one of `lenses` that `lens` names. `matrix`, `meaning`, `lens`, `for_stated_lens` and the sigmas
-repeat other values for their readers.
+repeat other values for their readers, and so do `parent_frame` and `child_frame`, which hold the
+words base, gripper and camera where `frames` does not know the name.
 """
 
 import itertools
@@ -30,6 +32,7 @@ from evercal.choices import ExportFormat
 from evercal.classes import frozen, frozen_arrays, html_table
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation, pose_distance
+from evercal.robot.frame_names import FrameNames
 from evercal.robot.mount import MountName, mount_named
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
@@ -161,6 +164,7 @@ class Calibration(FramedPose):
             "version": VERSION,
             "mount": self.mount,
             **self.transform_to_dict(),
+            "frames": vars(self.frames),
             "sigma_mm": self.sigma_mm,
             "sigma_deg": self.sigma_deg,
             "for_stated_lens": {
@@ -206,8 +210,7 @@ class Calibration(FramedPose):
             mount=data["mount"],
             parent_from_child=pose,
             covariance=np.asarray(data["covariance"], float),
-            parent_frame=str(data["parent_frame"]),
-            child_frame=str(data["child_frame"]),
+            frames=_names_in(data),
             camera=None if lens is None else Camera.from_dict(lens),
             lenses={k: Camera.from_dict(v) for k, v in data.get("lenses", {}).items()},
             images=tuple(ImageUse(**row) for row in data.get("images", [])),
@@ -249,6 +252,22 @@ class Calibration(FramedPose):
         from evercal.calibration.export.formats import export_files
 
         return export_files(self, format, path, **options).text
+
+
+def _names_in(data: Mapping[str, Any]) -> FrameNames:
+    """The names of a file; older ones state parent and child, by name or by the words for them."""
+    stated = {
+        mount_named(data["mount"]).parent: data["parent_frame"],
+        "camera": data["child_frame"],
+    }
+    known = {role: name for role, name in stated.items() if name != role}
+    frames = FrameNames.from_dict(data.get("frames", known))
+    if FrameNames.from_dict(known).or_of(frames) != frames:
+        raise ValueError(
+            "'frames' names other frames than 'parent_frame' and 'child_frame'; the file was edited"
+            " by hand: change both or leave 'frames' out"
+        )
+    return frames
 
 
 def read_calibration(path: PathLike) -> Calibration:

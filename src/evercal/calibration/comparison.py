@@ -104,9 +104,9 @@ def compare(
     Raises:
         InputError: The mounts, the frames or the image sizes differ.
     """
-    for name in ("mount", "parent_frame", "child_frame"):
-        values = [getattr(first, name), getattr(second, name)]
-        if values[0] != values[1]:
+    for name in ("mount", mount_named(first.mount).parent, "camera"):
+        values = [getattr(one.frames, name, one.mount) for one in (first, second)]
+        if values[0] != values[1] and all(values):
             raise InputError(
                 f"{name} is {values[0]!r} in the first and {values[1]!r} in the second: compare"
                 " calibrations of one camera in the same frames"

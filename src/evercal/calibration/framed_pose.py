@@ -9,6 +9,7 @@ import numpy as np
 from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.robot.mount import MountName, mount_named
 from evercal.typing import Array, JsonObject
 
@@ -55,10 +56,8 @@ class FramedPose:
     parent_from_child: SE3
     covariance: Array
     """(6, 6) of (translation in the parent frame, metres; rotation about child axes, radians)."""
-    parent_frame: str = "base"
-    """`base` for eye_to_hand, `gripper` for eye_in_hand, or the robot's names of them."""
-    child_frame: str = "camera"
-    """The camera's optical frame: x right, y down, z forward."""
+    frames: FrameNames = UNKNOWN
+    """Names of base, gripper and the camera's optical frame: x right, y down, z forward."""
     camera: Camera | None = None
     """Intrinsics that the pose belongs to: with others, its rays are others. See `for_lens`."""
     images: tuple[ImageUse, ...] = ()
@@ -77,6 +76,17 @@ class FramedPose:
     def on_gripper(self) -> bool:
         """Whether the gripper carries the camera; otherwise it stands still in the base."""
         return mount_named(self.mount).moves
+
+    @property
+    def parent_frame(self) -> str:
+        """Name of base (eye_to_hand) or gripper (eye_in_hand); this word if it is unknown."""
+        role = mount_named(self.mount).parent
+        return getattr(self.frames, role) or role
+
+    @property
+    def child_frame(self) -> str:
+        """Name of the camera's optical frame; `camera` if it is unknown."""
+        return self.frames.camera or "camera"
 
     @property
     def meaning(self) -> str:

@@ -38,6 +38,7 @@ from evercal.geometry.camera import COEFFICIENTS
 from evercal.geometry.rays import fit_rays
 from evercal.localization.intrinsics import STATED, cameras_in_scenes
 from evercal.recordings.images import pixels_of
+from evercal.robot.frame_names import FrameNames
 from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount, MountName, mount_named
 from evercal.typing import JsonObject
 
@@ -69,6 +70,7 @@ class _View:
     """The images with the pose of the camera in its parent frame."""
     fused: Fused
     """Mean of `in_parent`."""
+    names: FrameNames
 
 
 def calibrate(
@@ -120,7 +122,7 @@ def calibrate(
         mount=view.mount.name,
         parent_from_child=fused.pose,
         covariance=uncertainty.covariance,
-        parent_frame=view.mount.parent,
+        frames=view.names,
         camera=stated.resized(width, height),
         lenses=lenses,
         images=fused.uses,
@@ -164,7 +166,9 @@ def _view(
     if grippers is not None and (held or mount.moves):
         parent_from_scene = grippers if held else grippers.inverse()
         in_parent = in_parent_frame(located, parent_from_scene)
-    return _View(mount, held, located, parent_from_scene, in_parent, fuse(in_parent))
+    fused = fuse(in_parent)
+    names = _names(given, localizer.contents.scene(fused.scene).frames, held)
+    return _View(mount, held, located, parent_from_scene, in_parent, fused, names)
 
 
 def _held_thing_calibration(
@@ -181,9 +185,18 @@ def _held_thing_calibration(
         covariance=calibration.covariance + lens,
         error_terms=(*calibration.error_terms, ErrorTerm.of("lens", lens)),
         camera=camera,
+        frames=view.names,
         source=source,
         verdict=f"{calibration.verdict} {grip.sentence}",
     )
+
+
+def _names(given: Images, scene: FrameNames, held: bool) -> FrameNames:
+    """The camera is that of the images, and not the one that recorded the scene."""
+    names = given.frames
+    if given.base_from_gripper is None:
+        return replace(names.or_of(scene), camera=names.camera)
+    return names if held else replace(names, base=names.base or scene.base)
 
 
 def _checks(view: _View) -> ImageChecks:

@@ -13,6 +13,7 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.image_files import image_files
 from evercal.recordings.images import Picture, as_rgb
 from evercal.recordings.poses.pairing import poses_of_images
+from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.typing import PathLike, Strings
 
 ImageSource = PathLike | np.ndarray | Sequence[PathLike] | Sequence[np.ndarray]
@@ -31,6 +32,8 @@ class Images:
     """(n,) gripper pose at each image."""
     notes: Strings = ()
     """How poses and images were paired."""
+    frames: FrameNames = UNKNOWN
+    """Names of the frames of the gripper poses, and of the camera, where they are known."""
 
     def __post_init__(self) -> None:
         grippers = self.base_from_gripper

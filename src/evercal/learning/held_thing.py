@@ -93,7 +93,7 @@ def learn_held_thing(
         errors=errors or ArmErrors(),
     )
     options = sized(options, budget, contents)
-    options = replace(options, metric=recording.metric)
+    options = replace(options, metric=recording.metric, names=recording.frames)
     encoder = contents.encoder
     built = build_map(recording.name, posed.train, encoder, options, on_progress)
     scene = of_whole_images(built.scene, recording.train[0].camera)

@@ -66,7 +66,7 @@ def learn_posed(
 ) -> LearnedScene:
     """Build the map of a scene and fit the scatter of its poses to the held-out frames."""
     options = sized(options, budget, contents)
-    options = replace(options, metric=recording.metric)
+    options = replace(options, metric=recording.metric, names=recording.frames)
     encoder = contents.encoder
     built = build_map(recording.name, split.train, encoder, options, on_progress)
     if budget.auto:

@@ -46,6 +46,7 @@ from evercal.processes import cores
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, stated_grippers, stated_poses
 from evercal.robot.arm_offsets import ArmOffsets
+from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.robot.mount import Mount
 from evercal.robot.pose_errors import ArmErrors, shared_errors
 from evercal.typing import Array, IntArray, Strings
@@ -91,6 +92,8 @@ class MapOptions:
     """Intrinsics of whole images, where the frames are windows of them."""
     errors: ArmErrors = field(default_factory=ArmErrors)
     """What is known of the arm that moves the gripper."""
+    names: FrameNames = UNKNOWN
+    """Names of the frames of the recording."""
 
     def __post_init__(self) -> None:
         """Refuse numbers outside their range.
@@ -334,6 +337,7 @@ def _finish(
         frame=frame,
         unit=prepared.unit,
         train_frames=len(frames),
+        frames=options.names,
     )
     return BuiltMap(scene, adjusted, frames.names(numbers), hand_eye)
 

@@ -12,6 +12,7 @@ from evercal.features.encoder import Encoder
 from evercal.geometry import Camera
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import MapFrame
+from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.typing import IntArray
 
 if TYPE_CHECKING:
@@ -42,6 +43,8 @@ class SceneMap:
     unit: float | None = None
     """Units of length of the recording per unit of the map; None where the recording is in metres.
     A map of unknown unit is normalised to the depths of a room."""
+    frames: FrameNames = UNKNOWN
+    """Names of the frames of the recording; `camera` is that of the camera that recorded it."""
 
     @property
     def metric(self) -> bool:

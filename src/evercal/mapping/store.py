@@ -30,6 +30,7 @@ from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.recordings.frame import checked_name
+from evercal.robot.frame_names import FrameNames
 from evercal.storage.atomic import write_json
 from evercal.storage.manifest import Manifest
 from evercal.storage.stages import (
@@ -253,6 +254,7 @@ def write_scene(folder: Path, scene: SceneMap) -> None:
         "train_frames": scene.train_frames,
         "metric": scene.unit is None,
         "parent_frame": scene.parent_frame,
+        "frames": vars(scene.frames),
         "unit": scene.unit or 1.0,
         "intrinsics_sigma": list(scene.intrinsics_sigma),
         "frame": frame_to_dict(scene.frame),
@@ -316,6 +318,7 @@ def _read_scene(folder: Path) -> SceneMap:
         train_frames=content["train_frames"],
         intrinsics_sigma=(float(focal), float(centre), float(distortion)),
         parent_frame=content.get("parent_frame", "base"),
+        frames=FrameNames.from_dict(content.get("frames", {})),
         unit=unit,
     )
 

@@ -12,6 +12,7 @@ from evercal.bounds import bounds
 from evercal.errors import InputError, is_plain
 from evercal.geometry import SE3, Camera
 from evercal.recordings.images import Picture, file_of, files_in, is_readable, pixels_of
+from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.storage.text_files import few
 from evercal.typing import Image, Strings
 
@@ -94,6 +95,8 @@ class Recording:
     `base_from_camera` is then in that unit."""
     arm: "Arm | None" = None
     """Kinematics that `Frame.joints_rad` are values of, where gripper poses are computed."""
+    frames: FrameNames = UNKNOWN
+    """Names of the frames of its poses, where they are known."""
 
 
 def checked_name(name: str) -> str:

@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike
 
 from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.geometry import SE3, Camera
+from evercal.robot.frame_names import FrameNames
 from evercal.robot.mount import MountName
 from evercal.typing import Array
 
@@ -17,16 +18,14 @@ def calibration_of(
     pose: SE3, mount: MountName = "eye_to_hand", camera: Camera | None = CAMERA
 ) -> Calibration:
     """Return a calibration with typical frame names and three images, one of them unused."""
-    parent = "base_link" if mount == "eye_to_hand" else "tool0"
+    names = FrameNames("base_link", "tool0", "cam/optical-frame")
     images = (
         ImageUse("a.png", True),
         ImageUse("b.png", False, "blurred"),
         ImageUse("c.png", True),
     )
     covariance = np.diag([1e-6, 2e-6, 3e-6, 1e-8, 2e-8, 3e-8])
-    return Calibration(
-        mount, pose, covariance, parent, "cam/optical-frame", camera, images
-    )
+    return Calibration(mount, pose, covariance, names, camera, images)
 
 
 def poses() -> st.SearchStrategy[SE3]:

@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
+from evercal.robot.frame_names import FrameNames
 
 from .random_poses import CAMERA, POSE, calibration_of, quaternion_matrix, random_poses
 
@@ -166,7 +167,7 @@ def test_missing_inputs_are_refused(name: str) -> None:
 
 def test_without_images_the_frame_names_the_image() -> None:
     calibration = replace(
-        calibration_of(SE3.identity()), images=(), child_frame="camera"
+        calibration_of(SE3.identity()), images=(), frames=FrameNames()
     )
     meta = json.loads(calibration.export("nerfstudio"))
     assert [frame["file_path"] for frame in meta["frames"]] == ["camera.png"]

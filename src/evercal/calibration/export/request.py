@@ -21,6 +21,7 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.poses.conventions import numbers_from_poses, pose_convention
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
+from evercal.robot.mount import mount_named
 from evercal.storage.text_files import read_text, yaml_documents
 from evercal.typing import Array, PathLike
 
@@ -158,7 +159,8 @@ def prepare_export(
                 f"{role} frame {frame!r} is no name of a tf frame; use letters, digits, _ . - and"
                 f" inner /, such as 'camera_color_optical_frame' (rename with `parent` or `child`)"
             )
-    calibration = replace(calibration, parent_frame=parent, child_frame=child)
+    frames = {mount_named(calibration.mount).parent: parent, "camera": child}
+    calibration = replace(calibration, frames=replace(calibration.frames, **frames))
     robot = options.get("robot_poses")
     target = options.get("target_poses")
     if robot is not None and not isinstance(robot, RobotPoses):

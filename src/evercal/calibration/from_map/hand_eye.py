@@ -138,7 +138,7 @@ def hand_eye_of(
         start.mount.name,
         estimate.pose,
         estimate.covariance,
-        parent_frame=start.mount.parent,
+        frames=built.scene.frames,
         camera=built.scene.adjusted_camera,
         lenses={
             "stated": built.scene.camera,

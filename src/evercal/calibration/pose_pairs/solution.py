@@ -122,7 +122,6 @@ class PairSolution:
             mount=self.mount,
             parent_from_child=self.fit.at.parent_from_camera,
             covariance=(covariance + covariance.T) / 2,
-            parent_frame=self.parent,
             camera=self.camera,
             lenses=self._lenses(),
             images=self._images(),
