@@ -23,9 +23,10 @@ def main(out: Path) -> None:
     print(f"gripper_from_camera: {1000 * gripper_from_camera.pose.translation_m} mm")
     print(f"standard deviation: {gripper_from_camera.sigma_mm:.2f} mm per axis")
 
-    tripod = cell.calibrate(CELL / "tripod")
+    names = evercal.FrameNames("base_link", camera="tripod_optical")
+    tripod = cell.calibrate(CELL / "tripod", frames=names)
     tripod.write(out / "tripod.json")
-    tripod.export("easy_handeye2", out / "tripod.calib")
+    tripod.export("urdf", out / "tripod.urdf")
     print(tripod.meaning)
     print(tripod.verdict)
 

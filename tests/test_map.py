@@ -197,7 +197,8 @@ def test_calibration_is_written_and_exported(
         got.parent_from_child.matrix(), pose.matrix(), rtol=0, atol=1e-15
     )
     assert replace(got, parent_from_child=pose).to_dict() == calibration.to_dict()
-    text = calibration.export("launch_py", tmp_path / "camera.launch.py")
+    frames = {"parent": "base_link", "child": "optical"}
+    text = calibration.export("launch_py", tmp_path / "camera.launch.py", **frames)
     assert text
     assert (tmp_path / "camera.launch.py").read_text() == text
 

@@ -113,7 +113,7 @@ def test_python_of_the_readme_runs(
     ).splitlines()
     assert lines[0] == "bedroom"
     assert (tmp_path / "cell.evercal" / "manifest.json").is_file()
-    assert (tmp_path / "tripod.calib").read_text().count(":") > 10
+    assert (tmp_path / "tripod.yml").read_text().count(":") > 10
     assert any(re.match(r"True [45]\.\d+", line) for line in lines)  # bumped by 5 mm
     assert float(lines[-1]) > 80
 
@@ -153,7 +153,7 @@ def test_a_wrist_camera_from_nothing(cell: Path, tmp_path: Path) -> None:
     shift = re.search(r"moved by ([\d.]+) mm", printed)
     assert shift is not None
     assert 4 < float(shift[1]) < 6
-    assert (tmp_path / "wrist.calib").is_file()
+    assert (tmp_path / "wrist.urdf").is_file()
     assert (tmp_path / "report.html").is_file()
 
 
@@ -217,7 +217,7 @@ def test_first_example_locates_the_camera(
 @pytest.mark.slow("examples")
 def test_second_example_calibrates_and_detects_the_bump(tmp_path: Path) -> None:
     output = example("02_calibrate.py", tmp_path)
-    assert "pose of camera in base" in output
+    assert "pose of tripod_optical in base_link" in output
     shift = re.search(r"moved: True, ([\d.]+) mm", output)
     assert shift is not None
     assert 4 < float(shift[1]) < 6

@@ -11,6 +11,7 @@
     UncertainPose     a rigid transform with a covariance.
     Camera            intrinsics of one camera at one image size.
     Frame             one image with its camera and poses.
+    FrameNames        names of the frames of base, gripper and camera.
     Recording         frames of one place in recorded order.
     PosePairs         poses of the gripper and of a board in the camera.
 
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from evercal.recordings import Recording as Recording
     from evercal.recordings import load_recording as load_recording
     from evercal.recordings import read_image as read_image
+    from evercal.robot.frame_names import FrameNames as FrameNames
     from evercal.service.client import Client as Client
 
 __version__ = "0.2.0"
@@ -63,6 +65,7 @@ _PUBLIC = {
     "Camera": "evercal.geometry",
     "Client": "evercal.service.client",
     "Frame": "evercal.recordings",
+    "FrameNames": "evercal.robot.frame_names",
     "InputError": "evercal.errors",
     "LearnReport": "evercal.learning.report",
     "LocalizeOptions": "evercal.localization.options",

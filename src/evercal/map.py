@@ -8,6 +8,7 @@ what they need, so that a robot that only locates images loads no module that ca
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -16,6 +17,7 @@ from evercal.errors import InputError
 from evercal.learning.learned_scenes import LearnedScenes
 from evercal.mapping.store import MapStore
 from evercal.recordings.frame import Recording
+from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.robot.mount import MountName
 from evercal.typing import PathLike
 
@@ -134,6 +136,7 @@ class Map(LearnedScenes):
         robot_poses: PathLike | SE3 | None = None,
         camera: Camera | None = None,
         mount: MountName | None = None,
+        frames: FrameNames = UNKNOWN,
         on_image: Callable[[], object] = lambda: None,
     ) -> Calibration:
         """Calibrate a camera from its images; no marker is needed.
@@ -144,6 +147,7 @@ class Map(LearnedScenes):
                 the gripper, and where the scene is a thing in the gripper.
             camera: Intrinsics. Default: those of the camera that recorded the scene.
             mount: `eye_to_hand` or `eye_in_hand`. Default: decided from the camera's motion.
+            frames: names of the camera's frame, and of those of `robot_poses`.
             on_image: called after each image.
 
         Returns:
@@ -155,7 +159,7 @@ class Map(LearnedScenes):
         from evercal.calibration.from_images import calibrate
         from evercal.calibration.image_source import Images
 
-        given = Images.of(images, camera, robot_poses)
+        given = Images.of(images, camera, robot_poses, frames=frames)
         return calibrate(self.localizer, given, mount, on_image=on_image)
 
     def calibration(self, scene: str | None = None) -> Calibration:
@@ -182,6 +186,7 @@ class Map(LearnedScenes):
         points: Mapping[str, np.ndarray] | None = None,
         picks: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]] = (),
         unknown_scale: bool = False,
+        base_frame: str | None = None,
     ) -> MapAlignment:
         """Transform a scene in a frame of its own to the base frame, from images or points.
 
@@ -194,6 +199,7 @@ class Map(LearnedScenes):
             points: Instead of images: (3,) touched points by name in the base frame, metres.
             picks: Name, image (H, W, 3) and pixels (2,) by name of the point, of each image.
             unknown_scale: Estimate the scale also where the recording was in metres.
+            base_frame: Name of the base frame.
 
         Raises:
             InputError: No such scene, too few images or points, or another process writes into the
@@ -218,7 +224,8 @@ class Map(LearnedScenes):
                 found = align_by_gripper(
                     self.localizer, scene, given.images, poses, scale_known, boards
                 )
-            self._store.update(found.applied_to(own))
+            frames = replace(own.frames, base=base_frame or "")
+            self._store.update(replace(found.applied_to(own), frames=frames))
         self._changed()
         return found
 

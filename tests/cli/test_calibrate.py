@@ -13,6 +13,7 @@ from evercal.calibration.calibration import read_calibration
 from evercal.errors import with_options
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings import write_image
+from evercal.robot.frame_names import FrameNames
 
 if TYPE_CHECKING:
     from evercal.recordings import Frame
@@ -41,6 +42,8 @@ def test_folder_of_images_is_calibrated_and_checked(
     assert first.startswith("base_from_camera: the pose of camera in base")
     assert first.endswith("; scene hall")
     assert "4 of 4 used" in ran.out
+    export = f"next: evercal export {out} --format easy_handeye2 --parent BASE --child CAMERA"
+    assert ran.out.splitlines()[-1] == f"{export} --robot-frame GRIPPER"
     estimate = read_calibration(out)
     assert pose_distance(estimate.parent_from_child, truth_of(hall.test[3]))[0] < 0.004
     assert estimate.source["store"] == str(hall_store)
@@ -53,6 +56,23 @@ def test_folder_of_images_is_calibrated_and_checked(
     assert moved.code == 1
     assert moved.out.startswith("The camera has moved by ")
     assert moved.out.splitlines()[-1].startswith("next: evercal calibrate ")
+
+
+def test_frames_of_a_calibration_are_named(run, hall_store, four_images, tmp_path):
+    words = ("calibrate", hall_store, four_images, "--out", tmp_path / "c.json")
+    ran = run(*words, "--base-frame base_link --camera-frame optical")
+    assert ran.out.startswith("base_link_from_optical: ")
+    assert read_calibration(tmp_path / "c.json").frames == FrameNames(
+        "base_link", camera="optical"
+    )
+    assert ran.out.splitlines()[-1].endswith("easy_handeye2 --robot-frame GRIPPER")
+    launch = tmp_path / "c.launch.py"
+    export = ("export", tmp_path / "c.json", "--format launch_py --out", launch)
+    assert run(*export).code == 0
+    twice = run.refused(*words, "--base-frame a --camera-frame a")
+    assert "both called 'a'; rename one of them (--camera-frame, or" in twice
+    rig = ("calibrate", hall_store, f"left={four_images}", "--camera-frame a")
+    assert "--camera-frame: is of one camera" in run.refused(*rig)
 
 
 def test_cameras_of_a_rig(run, hall_store, four_images, hall, tmp_path):

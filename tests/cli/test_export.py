@@ -19,6 +19,7 @@ from evercal.calibration.export.request import (
     read_link_from_optical,
     standard_link_from_optical,
 )
+from evercal.cli.args import export_words
 from evercal.errors import with_options
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings.poses.robot_poses import read_robot_poses
@@ -37,7 +38,7 @@ def make(tmp_path) -> Any:
             mount,
             POSE,
             1e-8 * np.eye(6),
-            FrameNames(camera=child),
+            FrameNames("base", "gripper", child),
             camera,
             images,
             verdict="good",
@@ -80,6 +81,25 @@ def test_printed_and_written_text_are_equal(run, make, tmp_path, name):
     record = run.json("export", file, "--format", name)
     assert record["text"] == printed.out
     assert record["translation_m"] == POSE.translation_m.tolist()
+
+
+def test_unknown_frames_are_asked_for_and_named_by_the_next_step(run, make):
+    file = make()
+    known = read_calibration(file)
+    words = ("export", file, "--format", "easy_handeye2")
+    assert export_words(known, file) == words
+    unknown = replace(known, frames=FrameNames("base_link"))
+    unknown.write(file)
+    refused = run(*words)
+    assert (refused.code, refused.out) == (2, "")
+    assert refused.err == [
+        "error: the name of the camera's frame is unknown: give --child, such as"
+        " camera_color_optical_frame; the name of the gripper frame is unknown: give"
+        " --robot-frame, such as tool0 or flange"
+    ]
+    options = ("--child", "CAMERA", "--robot-frame", "GRIPPER")
+    assert export_words(unknown, file) == words + options
+    assert run(*words, *options).code == 0
 
 
 def test_binary_files_and_folders_are_not_printed(run, make, tmp_path):

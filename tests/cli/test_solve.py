@@ -48,8 +48,9 @@ def test_a_calibration_is_written_and_printed(run, tmp_path):
     difference = error(calibration.parent_from_child, simulated.parent_from_camera)
     assert np.linalg.norm(difference[:3]) < 0.001
     assert calibration.source["command"] == "solve"
-    record = run.json(*words)
+    record = run.json(*words, "--gripper-frame tool0 --camera-frame optical")
     assert record["matrix"] == calibration.to_dict()["matrix"]
+    assert (record["parent_frame"], record["child_frame"]) == ("tool0", "optical")
     assert record["checks"]["poses_used"] == 23
 
 

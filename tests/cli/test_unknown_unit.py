@@ -154,12 +154,14 @@ def test_alignment_gives_metres(run, phone_store, four_images, hall, tmp_path):
     refused = run("align", store, "hall --points", tmp_path / "fewer.csv", *files[2:])
     assert refused.code == 2
     assert f"point 'p0' is not in {tmp_path / 'fewer.csv'}" in refused.err[0]
-    ran = run("align", store, "hall", *files, "--json")
+    ran = run("align", store, "hall", *files, "--base-frame base_link --json")
     assert ran.code == 0, ran.err
     assert ran.json["scale"] == pytest.approx(1 / UNITS, rel=0.01)
     out = tmp_path / "c.json"
     assert run("calibrate", store, four_images, "--out", out).code == 0
-    pose = read_calibration(out).parent_from_child
+    calibration = read_calibration(out)
+    assert calibration.parent_frame == "base_link"
+    pose = calibration.parent_from_child
     assert pose_distance(pose, truth_of(hall.test[3]))[0] < 0.02
     [image] = run.json("localize", store, four_images / "00.png")["images"]
     assert image["unit"] == "metres"

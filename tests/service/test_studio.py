@@ -24,6 +24,7 @@ from evercal.live.camera import StreamCamera
 from evercal.live.robot import PoseFileRobot
 from evercal.map import Map
 from evercal.recordings import load_recording, write_image
+from evercal.robot.frame_names import FrameNames
 from evercal.service.studio.controls import Tasks
 from evercal.service.studio.devices import Devices
 from evercal.service.studio.page import StudioPage
@@ -296,8 +297,9 @@ def test_a_held_thing_leads_from_an_empty_folder_to_the_fixed_camera(tmp_path):
     )
     again = studio_in(tmp_path, cell, wrist_camera=None)
     assert [status(again, step) for step in ("4 Fixed", "or Hold")] == ["done", "done"]
-    again.export("fixed", "easy_handeye2")
+    again.export("fixed", "easy_handeye2", NAMES)
     found = read_calibration(tmp_path / "fixed.json")
+    assert found.frames == NAMES
     millimetres, degrees = pose_distance_mm_deg(found.parent_from_child, truth)
     assert millimetres < 1
     assert degrees < 0.1
@@ -323,6 +325,7 @@ def test_a_held_thing_leads_from_an_empty_folder_to_the_fixed_camera(tmp_path):
         thing.check(now, found)
 
 
+NAMES = FrameNames("base_link", "tool0", "camera_optical")
 NEEDING_MORE = ("moveit_samples", "joint_offsets", "corrected_urdf", "lerobot")
 """Formats that need poses of a board, or offsets of joints."""
 
@@ -339,11 +342,14 @@ def test_every_format_is_exported_or_says_why_not(cell, tmp_path):
         if name in NEEDING_MORE:
             with pytest.raises(InputError, match=f"{name}: "):
                 studio.export("fixed", name)
-        else:
+        elif FORMATS[name].frame == "tf" and not written:
+            with pytest.raises(InputError, match="the base frame is unknown"):
+                studio.export("fixed", name)
+            written.append(studio.export("fixed", name, NAMES))
+        else:  # the names are kept
             written.append(studio.export("fixed", name))
-    assert len(set(written)) == len(FORMATS) - len(NEEDING_MORE), (
-        "each has a file of its own"
-    )
+    # Each has a file of its own.
+    assert len(set(written)) == len(FORMATS) - len(NEEDING_MORE)
     assert status(studio, "5 Export") == "done"
 
 

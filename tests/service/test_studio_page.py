@@ -98,10 +98,14 @@ def calibrate(visit: Any, root: Path) -> None:
     shot(visit, "fixed")
     click(visit, "5 Export", "tab")
     click(visit, "Export file")
-    seen_until(visit, f"Wrote {root}/export/wrist.calib.")
+    seen_until(visit, "the base frame is unknown")
+    visit.locator("input[value='easy_handeye2']:not([type=hidden])").last.click()
+    visit.get_by_role("option", name="opencv").last.click()
+    click(visit, "Export file")
+    seen_until(visit, f"Wrote {root}/export/wrist_opencv.yml.")
     visit.locator(
         "input[value='camera on the gripper']:not([type=hidden])"
     ).last.click()
     visit.get_by_role("option", name="fixed camera").last.click()
     click(visit, "Export file")
-    seen_until(visit, f"Wrote {root}/export/fixed.calib.")
+    seen_until(visit, f"Wrote {root}/export/fixed_opencv.yml.")

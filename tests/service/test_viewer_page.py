@@ -18,6 +18,7 @@ from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.reports.scene import Frustum, KeyframeView
+from evercal.service.viewer import drawing
 from evercal.service.viewer.drawing import GRIPPER, add_arm, add_calibrations
 from evercal.service.viewer.html import chip_html, rows_html
 from evercal.service.viewer.page import Page, backdrop, start_server
@@ -132,6 +133,30 @@ def test_the_gripper_follows_the_joints(tmp_path):
         )
     finally:
         server.stop()
+
+
+def test_the_arm_stands_at_the_base_that_is_named(tmp_path, monkeypatch):
+    """Beside `base_link`, Universal Robots have `base`, turned by 180 degrees."""
+    turned = (
+        '<link name="turned"/><joint name="half" type="fixed"><parent link="base"/>'
+        '<child link="turned"/><origin rpy="0 0 3.141592653589793"/></joint></robot>'
+    )
+    (tmp_path / "arm.urdf").write_text(ARM.replace("</robot>", turned))
+    placed = {}
+    monkeypatch.setattr(
+        drawing, "place", lambda node, pose: placed.update({node.name: pose})
+    )
+    for bases, expected in ((["", "turned"], -1.0), (["", "unknown"], 1.0)):
+        server = start_server("127.0.0.1", 0, "page")
+        try:
+            node = server.scene.add_frame(GRIPPER, visible=False)
+            add_arm(server, tmp_path / "arm.urdf", node, ["gripper"], bases)
+        finally:
+            server.stop()
+        assert placed.keys() == {"/robot", GRIPPER}
+        for pose in placed.values():
+            found = pose.rotation_matrix()[0, 0]
+            assert found == pytest.approx(expected, abs=1e-9)
 
 
 def test_calibrations_have_their_place_and_ellipsoid():

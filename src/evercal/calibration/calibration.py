@@ -115,10 +115,6 @@ class Calibration(FramedPose):
             raise ValueError(
                 "a covariance has no negative eigenvalue, got one that has"
             )
-        if self.parent_frame == self.child_frame:
-            raise ValueError(
-                f"parent and child frame are both called {self.parent_frame!r}"
-            )
         object.__setattr__(self, "covariance", covariance)
         k = len(self.joints)
         of_joints = np.array(self.joint_covariance, float)
@@ -262,7 +258,7 @@ def _names_in(data: Mapping[str, Any]) -> FrameNames:
     }
     known = {role: name for role, name in stated.items() if name != role}
     frames = FrameNames.from_dict(data.get("frames", known))
-    if FrameNames.from_dict(known).or_of(frames) != frames:
+    if {**vars(frames), **known} != vars(frames):
         raise ValueError(
             "'frames' names other frames than 'parent_frame' and 'child_frame'; the file was edited"
             " by hand: change both or leave 'frames' out"

@@ -44,6 +44,7 @@ from evercal.typing import JsonObject
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
+    from evercal.mapping.scene_map import SceneMap
 
 CONTRADICTED_PX = 1.0
 """Stated intrinsics are replaced if the estimate moves rays by more than this, in pixels."""
@@ -167,7 +168,7 @@ def _view(
         parent_from_scene = grippers if held else grippers.inverse()
         in_parent = in_parent_frame(located, parent_from_scene)
     fused = fuse(in_parent)
-    names = _names(given, localizer.contents.scene(fused.scene).frames, held)
+    names = _names(given, localizer.contents.scene(fused.scene), held)
     return _View(mount, held, located, parent_from_scene, in_parent, fused, names)
 
 
@@ -191,12 +192,20 @@ def _held_thing_calibration(
     )
 
 
-def _names(given: Images, scene: FrameNames, held: bool) -> FrameNames:
+def _names(given: Images, scene: "SceneMap", held: bool) -> FrameNames:
     """The camera is that of the images, and not the one that recorded the scene."""
     names = given.frames
+    role = "gripper" if held else "base"
+    stated = vars(names)[role]
+    learned = vars(scene.frames)[role]
+    if learned and stated not in ("", learned):
+        raise InputError(
+            f"`{role}_frame` {stated}: scene {scene.name} is in {learned}; give it, with poses of"
+            " that frame"
+        )
     if given.base_from_gripper is None:
-        return replace(names.or_of(scene), camera=names.camera)
-    return names if held else replace(names, base=names.base or scene.base)
+        return replace(names.or_of(scene.frames), camera=names.camera)
+    return replace(names, **{role: learned or stated})
 
 
 def _checks(view: _View) -> ImageChecks:

@@ -56,6 +56,7 @@ class Images:
         camera: Camera | None = None,
         robot_poses: PathLike | SE3 | None = None,
         convention: str | None = None,
+        frames: FrameNames = UNKNOWN,
     ) -> Self:
         """Take images from files or arrays, see `Map.calibrate`."""
         items = _items(source)
@@ -67,7 +68,7 @@ class Images:
             if isinstance(poses, str | os.PathLike):
                 poses, notes = poses_of_images(Path(poses), files, convention)
             named = [(str(path), path) for path in files]
-            return cls(named, camera, poses, tuple(notes))
+            return cls(named, camera, poses, tuple(notes), frames)
         if isinstance(robot_poses, str | os.PathLike):
             raise InputError(
                 f"{robot_poses}: a file of robot poses is paired with image files by name, time or"
@@ -76,7 +77,7 @@ class Images:
         if any(are_paths):
             raise InputError("images: files and arrays; give either of them")
         arrays = [(f"image {i}", as_rgb(image)) for i, image in enumerate(items)]
-        return cls(arrays, camera, robot_poses)
+        return cls(arrays, camera, robot_poses, frames=frames)
 
 
 def _items(source: ImageSource) -> list[Any]:

@@ -40,6 +40,8 @@ class Align(args.Verb):
     """Touched points in the base frame: lines of name, x, y, z in metres."""
     picks: args.File = None
     """Points in images: lines of image, name, u, v in pixels; images relative to this file."""
+    base_frame: args.Frame = None
+    """Name of the base frame, which goes into exports."""
     unknown_scale: bool = False
     """Estimate the scale, for a scene that was not learned in metres. Default where the unit of
     length of its recording is unknown."""
@@ -89,6 +91,7 @@ class Align(args.Verb):
             convention=self.convention,
             boards=boards,
             unknown_scale=self.unknown_scale,
+            base_frame=self.base_frame,
         )
 
     def _by_points(self, cell: "Map") -> "MapAlignment":
@@ -108,7 +111,11 @@ class Align(args.Verb):
         folder = self.picks.parent
         picks = [(name, read_image(folder / name), p) for name, p in by_image.items()]
         return cell.align(
-            self.scene, points=points, picks=picks, unknown_scale=self.unknown_scale
+            self.scene,
+            points=points,
+            picks=picks,
+            unknown_scale=self.unknown_scale,
+            base_frame=self.base_frame,
         )
 
     def _show(self, alignment: "MapAlignment", unit: float) -> None:

@@ -17,10 +17,12 @@ from evercal.errors import InputError
 from evercal.processes import cores
 
 if TYPE_CHECKING:
+    from evercal.calibration.calibration import Calibration
     from evercal.geometry import SE3, Camera, UncertainPose
     from evercal.localization.localizer import Localizer
     from evercal.recordings import Recording
     from evercal.reports.inspected import LearnedLocalizer
+    from evercal.robot.frame_names import FrameNames
     from evercal.robot.pose_errors import ArmErrors
 
 MAP = "evercal"
@@ -109,7 +111,29 @@ class Verb:
 
 
 @frozen
-class Reading:
+class Named:
+    """Frames of the robot's software; their names go into exports."""
+
+    base_frame: Name = None
+    """The robot's base: a tf frame of a bag or a link of the URDF; elsewhere its name."""
+    gripper_frame: Name = None
+    """The gripper: a tf frame of a bag, a link of the URDF, or a feature or arm of a LeRobot
+    dataset; elsewhere its name."""
+    camera_frame: Name = None
+    """Name of the camera's optical frame. Default: that of the images of a bag."""
+
+    def names(self) -> "FrameNames":
+        """The names."""
+        from evercal.robot.frame_names import FrameNames
+
+        return FrameNames(*(name or "" for name in vars(self).values()))
+
+
+HowNamed = Annotated[Named, arg(name="")]
+
+
+@frozen
+class Reading(Named):
     """How the recording is read; options that do not apply to its format are refused."""
 
     format: Name = None
@@ -122,11 +146,6 @@ class Reading:
     """Images of a bag or a LeRobot dataset; required if there are several topics."""
     pose_topic: Topic = None
     """tf or joint states of a bag; required if there are several topics."""
-    base_frame: Name = None
-    """The robot's base, a tf frame of a bag or a link of the URDF."""
-    gripper_frame: Name = None
-    """The gripper: a tf frame of a bag, a link of the URDF, or a feature or arm of a LeRobot
-    dataset."""
     urdf: File = None
     """URDF of the robot, for recordings with joint angles."""
     pose_convention: Name = None
@@ -181,6 +200,16 @@ class ArmGiven:
 
 
 WhichArm = Annotated[ArmGiven, arg(name="")]
+
+
+def export_words(calibration: "Calibration", file: object) -> tuple[object, ...]:
+    """The words of an export of a calibration file to ROS, with options for unknown names."""
+    from evercal.calibration.export.request import unknown_frames
+
+    words = ["export", file, "--format", "easy_handeye2"]
+    for name, role in unknown_frames(calibration).items():
+        words += [option(name), role.upper()]
+    return tuple(words)
 
 
 def option(field: str) -> str:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -46,6 +46,7 @@ class Calibrate(args.Verb):
     the camera's motion."""
     camera: args.File = None
     """Intrinsics of these images. Default: those of the camera that recorded the scene."""
+    frames: args.HowNamed = field(default_factory=args.Named)
     out: args.OutFile = Path("calibration.json")
     """Output file."""
     at: args.At = None
@@ -65,7 +66,7 @@ class Calibrate(args.Verb):
         self.answer(
             {**calibration.to_dict(), **at_record(calibration, point)},
             *calibration_lines(calibration, point),
-            then=("export", self.out, "--format", "easy_handeye2"),
+            then=args.export_words(calibration, self.out),
         )
         return 0 if tier(calibration) else 1
 
@@ -83,6 +84,10 @@ class Calibrate(args.Verb):
                 f"{named[0]}: NAME=FOLDER and plain images cannot be mixed; give NAME=FOLDER for"
                 " every camera of the rig"
             )
+        if named and self.frames.camera_frame:
+            raise InputError(
+                "--camera-frame: is of one camera; give --child to the export of each"
+            )
         if named and self.mount == "eye_in_hand":
             raise InputError("--mount: the cameras of a rig are fixed; omit the option")
         return folders
@@ -91,7 +96,8 @@ class Calibrate(args.Verb):
         from evercal.calibration.image_source import Images
 
         camera = args.camera_for(self.camera, files)
-        images = Images.of(files, camera, self.robot_poses, self.convention)
+        names = self.frames.names()
+        images = Images.of(files, camera, self.robot_poses, self.convention, names)
         say_notes(images.notes)
         return images
 

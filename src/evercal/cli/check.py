@@ -92,7 +92,7 @@ class Check(args.Verb):
                 "to check an arm, give one recording with joint values and no poses"
             )
         reading = args.Reading(
-            None, self.camera, gripper_frame=self.gripper_frame, urdf=self.urdf
+            camera=self.camera, gripper_frame=self.gripper_frame, urdf=self.urdf
         )
         recording = replace(reading, pose_convention=self.convention).recording(
             self.images[0]

@@ -210,7 +210,8 @@ class Learn(args.Verb):
         self, recording: "Recording", report: "LearnReport", path: Path
     ) -> tuple[object, ...]:
         if report.hand_eye is not None:
-            return "export", self.calibration or self.store, "--format", "easy_handeye2"
+            calibration = report.hand_eye.calibration
+            return args.export_words(calibration, self.calibration or self.store)
         if not recording.metric:
             images = ("IMAGE...", "--robot-poses", "FILE")
             return "align", self.store, report.scene, *images

@@ -88,7 +88,7 @@ class Report(args.Verb):
             record["at"] = point.record(calibration.uncertain_pose)
             lines.append(f"  {point.text(calibration.uncertain_pose)}")
         lines += map("  {}".format, page.missing)
-        then = ("export", self.calibration, "--format", "easy_handeye2")
+        then = args.export_words(calibration, self.calibration)
         self.answer(record, *lines, f"wrote {self.out}", then=then)
         return 0
 

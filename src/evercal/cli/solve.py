@@ -47,6 +47,7 @@ class Solve(args.Verb):
     ] = None
     """Invert the poses of a file: robot, camera or both."""
     which: args.WhichArm = field(default_factory=args.ArmGiven)
+    frames: args.HowNamed = field(default_factory=args.Named)
     out: args.OutFile = Path("calibration.json")
     """Calibration file to write."""
 
@@ -61,11 +62,12 @@ class Solve(args.Verb):
             "robot_poses": str(self.robot_poses),
             "camera_poses": str(self.camera_poses),
         }
-        del source["out"], source["json"], source["which"]
-        calibration = self._with_image_paths(replace(self._solved(), source=source))
+        del source["out"], source["json"], source["which"], source["frames"]
+        solved = replace(self._solved(), source=source, frames=self.frames.names())
+        calibration = self._with_image_paths(solved)
         calibration.write(self.out)
         lines = (*calibration_lines(calibration), *_check_lines(calibration))
-        then = ("export", self.out, "--format", "easy_handeye2")
+        then = args.export_words(calibration, self.out)
         self.answer(calibration.to_dict(), *lines, then=then)
         return 0 if tier(calibration) else 1
 

@@ -10,8 +10,12 @@ from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.recordings.frame import Recording, with_images
 from evercal.recordings.read_options import ReadOptions
+from evercal.robot.frame_names import FrameNames
 from evercal.storage.text_files import named_errors
 from evercal.typing import PathLike, Strings
+
+FRAMES = ("base_frame", "gripper_frame", "camera_frame")
+"""Fields of `ReadOptions` that name frames, for all formats that do not choose by them."""
 
 
 @frozen
@@ -44,19 +48,12 @@ FORMATS: dict[FormatName, RecordingFormat] = {
     "wrist": RecordingFormat(
         "wrist",
         "images beside base_from_gripper.csv, joints.csv, base_from_camera.csv",
-        ("camera", "base_frame", "gripper_frame", "urdf", "pose_convention"),
+        ("camera", "urdf", "pose_convention"),
     ),
     "lerobot": RecordingFormat(
         "lerobot",
         "meta/info.json",
-        (
-            "camera",
-            "image_topic",
-            "base_frame",
-            "gripper_frame",
-            "urdf",
-            "pose_convention",
-        ),
+        ("camera", "image_topic", "gripper_frame", "urdf", "pose_convention"),
     ),
     "rosbag": RecordingFormat(
         "ros_bag",
@@ -98,7 +95,7 @@ def load_recording(
     format = format_of(root, format)
     uses = FORMATS[format].uses
     for option in options.given():
-        if option not in ("every", *uses):
+        if option not in ("every", *FRAMES, *uses):
             users = [key for key, entry in FORMATS.items() if option in entry.uses]
             raise InputError(
                 f"`{option}`: not used by recordings of format {format}, only by"
@@ -113,6 +110,8 @@ def load_recording(
     with named_errors(root, "recording"):
         folder = root if root.is_dir() else root.parent
         recording = with_images(recording, folder)
+    names = [getattr(options, o) or "" if o not in uses else "" for o in FRAMES]
+    recording = replace(recording, frames=recording.frames.or_of(FrameNames(*names)))
     if (root / "masks").is_dir():
         from evercal.recordings.masks import with_masks
 

@@ -18,10 +18,13 @@ class ReadOptions:
     pose_topic: str | None = None
     """tf or joint state topic of a bag. Required if several topics move the same frame or joint."""
     base_frame: str | None = None
-    """The robot's base: a tf frame of a bag or a link of the URDF. If omitted, the usual one."""
+    """The robot's base: a tf frame of a bag or a link of the URDF, if omitted the usual one.
+    Elsewhere its name."""
     gripper_frame: str | None = None
-    """The gripper: a tf frame, a link of the URDF, or a feature or arm of a LeRobot dataset. If
-    omitted, the usual one."""
+    """The gripper: a tf frame, a link of the URDF, or a feature or arm of a LeRobot dataset, if
+    omitted the usual one. Elsewhere its name."""
+    camera_frame: str | None = None
+    """Name of the camera's optical frame. If omitted, that of the images of a bag."""
     urdf: Path | None = None
     """URDF of the robot, for joint angles. If omitted, the file beside them."""
     pose_convention: ConventionName | str | None = None

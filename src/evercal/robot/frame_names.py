@@ -3,6 +3,7 @@
 from typing import Any, Self
 
 from evercal.classes import frozen
+from evercal.errors import InputError
 
 
 @frozen
@@ -15,6 +16,16 @@ class FrameNames:
     """Frame whose poses are stated."""
     camera: str = ""
     """The camera's optical frame."""
+
+    def __post_init__(self) -> None:
+        """Refuse two frames of one name."""
+        names = [*filter(None, vars(self).values())]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(
+                    f"two frames are both called {name!r}; rename one of them (`camera_frame`, or"
+                    " `child` of an export)"
+                )
 
     def or_of(self, other: "FrameNames") -> "FrameNames":
         """These names; those of `other` where they are unknown."""
@@ -29,7 +40,10 @@ class FrameNames:
         """The inverse of `asdict`; other values raise ValueError."""
         if not all(isinstance(name, str) for name in names.values()):
             raise ValueError(f"names of frames are texts, got {names}")
-        return cls(**names)
+        try:
+            return cls(**names)
+        except InputError as error:
+            raise ValueError(str(error)) from None
 
 
 UNKNOWN = FrameNames()

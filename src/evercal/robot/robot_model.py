@@ -11,6 +11,7 @@ from evercal.bounds import require_at_most
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.robot.arm import Arm, MovingJoint
+from evercal.robot.frame_names import FrameNames
 from evercal.robot.urdf import Joint, parsed_urdf
 from evercal.storage.text_files import named_errors, naming, refuse_repeated
 from evercal.typing import Array, PathLike
@@ -30,6 +31,7 @@ class ArmPoses(NamedTuple):
     """(n, k) values of the joints of the arm, radians, or metres of sliding joints."""
     notes: list[str]
     """Links that were chosen, and joints beyond their limits."""
+    frames: FrameNames
 
 
 class RobotModel:
@@ -110,7 +112,8 @@ class RobotModel:
             self._refuse_degrees(name, column, source)
         for name, column in zip(arm.joints, values.T, strict=True):
             notes += self._beyond_limits(name, column)
-        return ArmPoses(arm.poses(values), arm, values, notes)
+        frames = FrameNames(base, gripper)
+        return ArmPoses(arm.poses(values), arm, values, notes, frames)
 
     def arm(self, base: str, gripper: str) -> Arm:
         """The chain between two links; its joint values are those that others do not mimic."""

@@ -46,6 +46,7 @@ class Bag:
 
     kind: str
     messages: list[tuple[str, str, int, Any]] = field(default_factory=list)
+    optical: str = "camera_optical"
 
     def __post_init__(self) -> None:
         self.store = get_typestore(Stores.LATEST)
@@ -102,7 +103,7 @@ class Bag:
             topic,
             "sensor_msgs/msg/Image",
             seconds,
-            header=self.header(seconds if stamped else None, "camera_optical"),
+            header=self.header(seconds if stamped else None, self.optical),
             height=height,
             width=width,
             encoding=encoding,
@@ -113,7 +114,7 @@ class Bag:
 
     def compressed(self, seconds: float, topic: str, data: bytes, what: str) -> None:
         """An image file."""
-        head = self.header(seconds, "camera_optical")
+        head = self.header(seconds, self.optical)
         content = np.frombuffer(data, np.uint8)
         kind = "sensor_msgs/msg/CompressedImage"
         self.add(topic, kind, seconds, header=head, format=what, data=content)
@@ -132,7 +133,7 @@ class Bag:
             topic,
             "sensor_msgs/msg/CameraInfo",
             0.0,
-            header=self.header(0.0, "camera_optical"),
+            header=self.header(0.0, self.optical),
             width=size[0],
             height=size[1],
             distortion_model=model,

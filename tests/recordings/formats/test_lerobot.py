@@ -16,6 +16,7 @@ import pytest
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings import ReadOptions, generic, load_recording, write_image
+from evercal.robot.frame_names import FrameNames
 
 from ..checks import assert_pose, refused
 
@@ -208,7 +209,7 @@ def test_joints_and_a_urdf_in_radians_or_degrees(tmp_path: Path) -> None:
             assert_pose(frame.base_from_gripper, expected, 1e-6)
     message = "grad: joint angles are rad or deg"
     refuses(message, root, urdf=urdf, pose_convention="grad")
-    refuses("`base_frame` goes with `urdf` only", root, base_frame="base")
+    assert recording.frames == FrameNames("base", "tip")
     change_names(root, ["shoulder.pos", "shoulder"], "observation.state")
     refuses(r"state: 'shoulder' comes twice", root, urdf=urdf)
     change_names(root, {"left": ["shoulder"], "right": ["reach"]}, "observation.state")

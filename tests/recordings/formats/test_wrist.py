@@ -201,8 +201,8 @@ def test_missing_and_ambiguous_files_are_refused(tmp_path: Path) -> None:
     refused(r"holds base_from_gripper\.csv and joints\.csv", load_recording, tmp_path)
     (tmp_path / "joints.csv").unlink()
     write_image(tmp_path / "1.png", np.zeros((24, 32, 3), np.uint8))
-    options = ReadOptions(gripper_frame="tool0")
-    message = "`gripper_frame`: .* holds poses already"
+    options = ReadOptions(urdf=tmp_path / "arm.urdf")
+    message = "`urdf`: .* holds poses already"
     refused(message, load_recording, tmp_path, options=options)
     (tmp_path / "base_from_gripper.csv").unlink()
     message = "no gripper poses; expected base_from_gripper"

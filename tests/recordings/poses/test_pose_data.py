@@ -18,6 +18,7 @@ from evercal.recordings.poses.conventions import (
 )
 from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import read_robot_poses
+from evercal.robot.frame_names import FrameNames
 
 from ..checks import refused
 
@@ -116,12 +117,15 @@ def test_messages_of_ros_are_read_with_their_times(tmp_path: Path) -> None:
             + "---\n"
         )
         (tmp_path / name).write_text(text)
-        np.testing.assert_allclose(
-            assert_arm(tmp_path / name).stamps_s, np.arange(5) + 0.5
-        )
+        read = assert_arm(tmp_path / name)
+        np.testing.assert_allclose(read.stamps_s, np.arange(5) + 0.5)
+        assert read.frames == FrameNames("base", "tool0" if name == "tf.yaml" else "")
     tf[1]["transforms"][0]["child_frame_id"] = "camera"
     (tmp_path / "p.yaml").write_text(yaml.safe_dump_all(tf))
     refused("holds poses of camera and tool0", read_robot_poses, tmp_path / "p.yaml")
+    other = {**STAMPED[0], "header": {**STAMPED[0]["header"], "frame_id": "base_link"}}
+    (tmp_path / "p.yaml").write_text(yaml.safe_dump_all([other, *STAMPED[1:]]))
+    refused("poses of base and base_link", read_robot_poses, tmp_path / "p.yaml")
 
 
 def test_the_poses_of_the_camera_are_read_beside_those_of_the_robot(

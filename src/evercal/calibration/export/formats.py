@@ -7,7 +7,12 @@ from typing import Literal, TypeAlias, Unpack
 from evercal.calibration.export import joints as arm
 from evercal.calibration.export import writers as to
 from evercal.calibration.export.read_back import require_read_back
-from evercal.calibration.export.request import Export, ExportOptions, prepare_export
+from evercal.calibration.export.request import (
+    Export,
+    ExportOptions,
+    prepare_export,
+    require_names,
+)
 from evercal.calibration.framed_pose import FramedPose
 from evercal.choices import ExportFormat
 from evercal.classes import frozen, frozen_arrays
@@ -148,6 +153,8 @@ def export_files(
     if path is not None:
         name = Path(path).name.split(".")[0] or name
     export = prepare_export(calibration, name, **options)
+    if exporter.frame == "tf":
+        require_names(export.calibration, key.startswith("easy_handeye"))
     if exporter.frame == "optical" and options.get("via") is not None:
         raise InputError(
             f"{key} holds the pose of the camera, not of {export.child!r}; omit `via`"

@@ -21,6 +21,7 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.poses.conventions import numbers_from_poses, pose_convention
 from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
+from evercal.robot.frame_names import FrameNames
 from evercal.robot.mount import mount_named
 from evercal.storage.text_files import read_text, yaml_documents
 from evercal.typing import Array, PathLike
@@ -30,6 +31,15 @@ PoseSource: TypeAlias = RobotPoses | PathLike | None
 # tf itself refuses only empty names and a leading slash; blanks, quotes and brackets would break
 # the shell commands, launch files and XML that hold the names.
 _FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(/[A-Za-z0-9_.\-]+)*")
+
+
+_UNKNOWN = {
+    "base": "the base frame is unknown: give `{}` (of Universal Robots, base for poses of the"
+    " controller and base_link for those of tf, which are turned by 180 deg)",
+    "gripper": "the gripper frame is unknown: give `{}`, such as tool0 or flange",
+    "camera": "the camera's frame is unknown: give `{}`, such as camera_color_optical_frame",
+}
+"""What to do without the name of a frame."""
 
 
 class ExportOptions(TypedDict, total=False):
@@ -51,7 +61,7 @@ class ExportOptions(TypedDict, total=False):
     via_optical: bool
     """Whether the two frames share their origin."""
     robot_frame: str | None
-    """The robot frame that is not the parent: the gripper for eye_to_hand, else the base."""
+    """New name of the robot's other frame: the gripper for eye_to_hand, else the base."""
     robot_poses: PoseSource
     """base_from_gripper of every image, or a file of them."""
     target_poses: PoseSource
@@ -74,8 +84,6 @@ class Export:
     """Calibration with the exported frames."""
     name: str
     """Name of the calibration in easy_handeye."""
-    robot_frame: str | None
-    """See `ExportOptions.robot_frame`."""
     robot_poses: RobotPoses | None
     """base_from_gripper of every image."""
     target_poses: RobotPoses | None
@@ -138,29 +146,25 @@ def prepare_export(
 ) -> Export:
     """Turn the pose for the intrinsics, rename and move its frames, and read the files."""
     calibration = _for_lens(calibration, options.get("lens"))
-    parent = options.get("parent") or calibration.parent_frame
-    child = options.get("child") or calibration.child_frame
+    role_of = _frames_of_options(calibration)
+    stated = {role: options.get(option) or "" for option, role in role_of.items()}
+    names = FrameNames(**stated).or_of(calibration.frames)
     link = options.get("via")
-    other = options.get("robot_frame")
-    if parent in (child, link):
-        raise InputError(
-            f"parent and child frame are both called {parent!r}; rename one of them"
-        )
-    link_from_optical = _link_from_optical(child, options)
+    link_from_optical = _link_from_optical(names.camera or "camera", options)
     if link is not None:
         moved = calibration.uncertain_pose @ link_from_optical.inverse()
         calibration = replace(
             calibration, parent_from_child=moved.pose, covariance=moved.covariance
         )
-        child = link
-    for role, frame in (("parent", parent), ("child", child), ("robot", other)):
-        if frame is not None and not _FRAME.fullmatch(frame):
+        names = replace(names, camera=link)
+    for option, role in role_of.items():
+        frame = vars(names)[role]
+        if frame and not _FRAME.fullmatch(frame):
             raise InputError(
                 f"{role} frame {frame!r} is no name of a tf frame; use letters, digits, _ . - and"
-                f" inner /, such as 'camera_color_optical_frame' (rename with `parent` or `child`)"
+                f" inner /, such as 'camera_color_optical_frame' (rename with `{option}`)"
             )
-    frames = {mount_named(calibration.mount).parent: parent, "camera": child}
-    calibration = replace(calibration, frames=replace(calibration.frames, **frames))
+    calibration = replace(calibration, frames=names)
     robot = options.get("robot_poses")
     target = options.get("target_poses")
     if robot is not None and not isinstance(robot, RobotPoses):
@@ -169,7 +173,29 @@ def prepare_export(
         robot = read_robot_poses(robot, convention, what=what, option="`convention`")
     if target is not None and not isinstance(target, RobotPoses):
         target = read_robot_poses(target, what="file of target poses", option=None)
-    return Export(calibration, name, other, robot, target, options)
+    return Export(calibration, name, robot, target, options)
+
+
+def _frames_of_options(calibration: FramedPose) -> dict[str, str]:
+    mount = mount_named(calibration.mount)
+    return {"parent": mount.parent, "child": "camera", "robot_frame": mount.scene}
+
+
+def unknown_frames(calibration: FramedPose) -> dict[str, str]:
+    """Frames without a name, by the option that names them: base, gripper or camera."""
+    names = vars(calibration.frames)
+    frames = _frames_of_options(calibration)
+    return {option: role for option, role in frames.items() if not names[role]}
+
+
+def require_names(calibration: FramedPose, both: bool) -> None:
+    """Refuse unknown names of parent and child, and of the robot's other frame for `both`."""
+    unknown = unknown_frames(calibration)
+    if not both:
+        unknown.pop("robot_frame", None)
+    if unknown:
+        hints = [_UNKNOWN[role].format(option) for option, role in unknown.items()]
+        raise InputError(f"the name of {'; the name of '.join(hints)}")
 
 
 def _for_lens(calibration: FramedPose, lens: Camera | PathLike | None) -> FramedPose:

@@ -189,14 +189,10 @@ def _transform(export: Export) -> dict[str, dict[str, float]]:
 
 
 def _handeye_frames(export: Export) -> dict[str, str]:
-    base = export.parent
-    effector = export.robot_frame or "gripper"
-    if export.in_hand:
-        base = export.robot_frame or "base"
-        effector = export.parent
+    names = export.calibration.frames
     return {
-        "robot_base_frame": base,
-        "robot_effector_frame": effector,
+        "robot_base_frame": names.base,
+        "robot_effector_frame": names.gripper,
         "tracking_base_frame": export.child,
         "tracking_marker_frame": "no_marker",  # the tools require a name
     }

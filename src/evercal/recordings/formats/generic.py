@@ -17,6 +17,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, write_image
+from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.storage import write_json
 from evercal.storage.records import of_format
 from evercal.storage.text_files import (
@@ -49,6 +50,7 @@ def load(root: Path) -> Recording:
     data = read_json(file, "scene file", "convert the recording again")
     with named_errors(file, "scene file"):
         frames = of_format(data, _FORMAT, _VERSION, partial(_frames, root))
+        names = FrameNames.from_dict(data.get("frame_names", {}))
     name = data.get("name")
     if not isinstance(name, str) or not name:
         name = root.resolve().name
@@ -59,6 +61,7 @@ def load(root: Path) -> Recording:
         data.get("untracked", 0),
         notes=tuple(data.get("notes", ())),
         metric=data.get("unit") != "unknown",
+        frames=names,
     )
 
 
@@ -104,6 +107,7 @@ def write(
         writer.untracked = recording.untracked
         writer.notes = recording.notes
         writer.metric = recording.metric
+        writer.names = recording.frames
         for split in ("train", "test"):
             for frame in getattr(recording, split):
                 writer.add(frame, split)
@@ -121,6 +125,7 @@ class SceneWriter:
         self.untracked = 0
         self.notes: Strings = ()
         self.metric = True
+        self.names = UNKNOWN
         self.render: JsonObject | None = None
         self._root = Path(root)
         self._name = name
@@ -148,6 +153,7 @@ class SceneWriter:
             },
             "frames": list(self._entries.values()),
             "untracked": self.untracked,
+            "frame_names": vars(self.names),
         }
         if not self.metric:
             data["unit"] = "unknown"

@@ -88,7 +88,14 @@ def _load(root: Path, options: ReadOptions) -> Recording:
         notes.append(f"{episodes} of {total} episodes are in the folder")
     frames[0].read_image()
     name = root.resolve().name
-    return Recording(name, tuple(frames), (), notes=tuple(notes), arm=stated.arm)
+    return Recording(
+        name,
+        tuple(frames),
+        (),
+        notes=tuple(notes),
+        arm=stated.arm,
+        frames=stated.frames,
+    )
 
 
 def _info(root: Path) -> Info:

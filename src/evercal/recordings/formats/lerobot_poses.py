@@ -87,8 +87,6 @@ def feature_poses(
     names = _names(info, column)
     if options.urdf is not None:
         return _joint_poses(root, names, values, options)
-    if options.base_frame is not None:
-        raise InputError(f"{root}: `base_frame` goes with `urdf` only; leave it out")
     count = values.shape[1]
     notes = []
     with named_errors(f"{root}: {column}", "poses"), asking_for("`pose_convention`"):

@@ -95,7 +95,8 @@ def load(root: Path, options: ReadOptions) -> Recording:
     else:
         camera = _bag_camera(bag, topic, (width, height))
     stamps = np.array([shot.stamp_ns for shot in shots])
-    poses = poses_at_images(bag, stamps, shots[0].frame_id, options)
+    camera_frame = options.camera_frame or shots[0].frame_id
+    poses = poses_at_images(bag, stamps, camera_frame, options)
     frames = []
     for i in np.flatnonzero(poses.valid).tolist():
         joints = poses.stated.joints_of(i)
@@ -109,9 +110,16 @@ def load(root: Path, options: ReadOptions) -> Recording:
             f" more than {MAX_GAP_S:g} s in which the gripper moved"
         )
     notes += poses.notes
-    arm = poses.stated.arm
-    name = root.resolve().stem
-    return Recording(name, tuple(frames), (), lost, notes=tuple(notes), arm=arm)
+    stated = poses.stated
+    return Recording(
+        root.resolve().stem,
+        tuple(frames),
+        (),
+        lost,
+        notes=tuple(notes),
+        arm=stated.arm,
+        frames=replace(stated.frames, camera=camera_frame),
+    )
 
 
 @frozen_arrays

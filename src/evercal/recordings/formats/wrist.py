@@ -29,6 +29,7 @@ from evercal.recordings.poses.robot_poses import (
 )
 from evercal.recordings.poses.row_files import number_array, read_rows, same_numbers
 from evercal.recordings.read_options import ReadOptions
+from evercal.robot.frame_names import FrameNames
 from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import named_errors, read_json, refuse_repeated
 
@@ -162,7 +163,12 @@ def _frames(root: Path, layout: RecordingLayout, options: ReadOptions) -> Record
     lost = len(images) - len(frames)
     name = root.resolve().name
     notes = (*notes, *more)
-    return Recording(name, tuple(frames), (), lost, notes=notes, arm=rows.arm)
+    named = rows.frames
+    if not is_gripper:
+        named = FrameNames(named.base, camera=named.gripper)
+    return Recording(
+        name, tuple(frames), (), lost, notes=notes, arm=rows.arm, frames=named
+    )
 
 
 def _rows(
@@ -178,12 +184,11 @@ def _rows(
             numbers = np.roll(number_array(numbers, "'poses'"), 3, axis=-1)
             names = tuple(map(str, range(len(numbers))))
             return RobotPoses(names, None, poses_from_numbers(numbers, _RECORD3D)), []
-    for option in ("urdf", "base_frame", "gripper_frame"):
-        if getattr(options, option) is not None:
-            raise InputError(
-                f"`{option}`: {file} holds poses already; leave the option out, or give"
-                f" joint angles in joints.csv instead"
-            )
+    if options.urdf is not None:
+        raise InputError(
+            f"`urdf`: {file} holds poses already; leave the option out, or give joint angles in"
+            " joints.csv instead"
+        )
     convention = options.pose_convention or convention
     poses = read_robot_poses(
         file, convention, what="file of poses", option="`pose_convention`"

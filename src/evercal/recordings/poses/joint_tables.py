@@ -72,7 +72,14 @@ def poses_of_arm(moved: ArmPoses, rows: LabelledRows | None = None) -> RobotPose
     """Poses of an arm with their joint values, and with the names and times of rows."""
     names = rows and rows.names
     stamps_s = rows and rows.stamps_s
-    return RobotPoses(names, stamps_s, moved.poses, arm=moved.arm, joints=moved.joints)
+    return RobotPoses(
+        names,
+        stamps_s,
+        moved.poses,
+        arm=moved.arm,
+        joints=moved.joints,
+        frames=moved.frames,
+    )
 
 
 def in_radians(

@@ -30,6 +30,7 @@ from evercal.recordings.poses.row_files import (
     plain_names,
     row_labels,
 )
+from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.typing import Array
 
 
@@ -45,6 +46,8 @@ class PoseTable(NamedTuple):
     """(n,) seconds, if there are any."""
     fixed: bool = False
     """Whether keys of the file state the poses themselves."""
+    frames: FrameNames = UNKNOWN
+    """Names of the frames that messages of ROS state."""
 
 
 class ColumnGroup(NamedTuple):

@@ -37,6 +37,7 @@ from evercal.recordings.poses.row_files import (
     row_labels,
     text_cells,
 )
+from evercal.robot.frame_names import FrameNames
 from evercal.storage.text_files import natural_key
 
 _KEYS = (
@@ -124,17 +125,22 @@ def _of_objects(entries: list[Any], given: Given, robot: bool) -> PoseTable:
     require_at_most(len(keys) * len(rows), "numbers", "values")
     columns = {key: [row.get(key) for row in rows] for key in keys}
     columns = _of_role(columns, given, robot)
-    frames = columns.get("child_frame_id", ())
-    frames = sorted({*map(str, frames)})
-    if len(frames) > 1:
-        raise ValueError(
-            f"it holds poses of {' and '.join(frames)}; keep those of one frame"
-        )
+    frames = [_frame_of(columns, key) for key in ("header_frame_id", "child_frame_id")]
     table = _of_arrays(columns, given, plural=False)
     if table is None:
         table = _of_cells(columns, given)
     fixed = "quaternion_wxyz" in columns and "matrix" not in columns
-    return table._replace(fixed=fixed)
+    return table._replace(fixed=fixed, frames=FrameNames(*frames))
+
+
+def _frame_of(columns: Columns, key: str) -> str:
+    """The frame that all messages name, without the leading slash of old ROS 1 programs."""
+    frames = sorted({*map(str, columns.get(key, ()))})
+    if len(frames) > 1:
+        raise ValueError(
+            f"it holds poses of {' and '.join(frames)}; keep those of one frame"
+        )
+    return "".join(frames).lstrip("/")
 
 
 def _of_cells(columns: Columns, given: Given) -> PoseTable:

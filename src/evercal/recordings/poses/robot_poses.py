@@ -7,6 +7,7 @@ one such file for each pose. docs/formats.md has examples of all kinds.
 import os
 import re
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from evercal.recordings.poses.pose_table import read_pose_table
 from evercal.recordings.poses.pose_units import checked_poses
 from evercal.recordings.poses.row_files import Names
 from evercal.robot.arm import Arm
+from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.storage.text_files import (
     documents,
     named_errors,
@@ -77,6 +79,8 @@ class RobotPoses:
     """Arm whose joint values are stated instead of poses."""
     joints: Array | None = None
     """(n, k) values of its joints, radians, or metres of sliding joints."""
+    frames: FrameNames = UNKNOWN
+    """Names of base and gripper, where they are known."""
 
     def __len__(self) -> int:
         """Number of poses."""
@@ -122,11 +126,10 @@ def read_robot_poses(
             table = _file(path, given, what, robot)
         poses = _poses(table, camera_from)
         refuse_repeated(table.names or (), "names are unique")
+        rows = RobotPoses(table.names, table.stamps_s, poses, frames=table.frames)
         if table.fixed:
-            return RobotPoses(table.names, table.stamps_s, poses)
-        return RobotPoses(
-            table.names, table.stamps_s, poses, table.numbers, table.convention
-        )
+            return rows
+        return replace(rows, numbers=table.numbers, convention=table.convention)
 
 
 def read_last_robot_pose(

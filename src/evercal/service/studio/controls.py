@@ -12,6 +12,7 @@ from evercal.calibration.export.formats import FORMATS
 from evercal.calibration.from_map.next_views import NextViews
 from evercal.errors import InputError
 from evercal.live.coverage import POSITION_MM, ROTATION_DEG
+from evercal.robot.frame_names import FrameNames
 from evercal.service.studio.devices import Which
 from evercal.service.studio.steps import STEPS
 from evercal.service.studio.studio import FIXED_IMAGES, Studio
@@ -206,10 +207,16 @@ class Controls:
     def _export(self) -> None:
         camera = self._gui.add_dropdown("Calibration", tuple(_CAMERAS))
         format = self._gui.add_dropdown("Format", tuple(FORMATS))
-        self._button(
-            "Export file",
-            lambda: self._studio.export(_CAMERAS[chosen(camera)], chosen(format)),
-        )
+        fields = [
+            self._gui.add_text(f"{role} frame", "")
+            for role in ("Base", "Gripper", "Camera")
+        ]
+
+        def export() -> str:
+            names = FrameNames(*(field.value.strip() for field in fields))
+            return self._studio.export(_CAMERAS[chosen(camera)], chosen(format), names)
+
+        self._button("Export file", export)
 
     def _keep(self, handle: Any, **properties: Callable[[], Any]) -> None:
         def update() -> None:

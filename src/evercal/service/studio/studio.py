@@ -27,6 +27,7 @@ from evercal.map import Map
 from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.frame import stated_grippers
 from evercal.recordings.images import write_jpeg
+from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.service.studio.devices import Connection, Devices, Which
 from evercal.storage import sha256_file, write_json
 from evercal.typing import Strings
@@ -306,9 +307,11 @@ class Studio:
         confidence = f"confidence {100 * shift.confidence:.1f} %"
         return f"The camera has moved by {size} ({confidence}). Calibrate it again."
 
-    def export(self, which: Which, format: str) -> str:
-        """Export a calibration in a format of `evercal export`."""
+    def export(self, which: Which, format: str, names: FrameNames = UNKNOWN) -> str:
+        """Export a calibration in a format of `evercal export`; it keeps the names."""
         calibration = self._made(which)
+        calibration = replace(calibration, frames=names.or_of(calibration.frames))
+        self._write(which, calibration)
         chosen = FORMATS[format]
         folder = self.out / "export"
         folder.mkdir(exist_ok=True)

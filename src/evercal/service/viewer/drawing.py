@@ -1,6 +1,7 @@
 """Cameras, maps, calibrations and the arm in the scene of a page."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -197,17 +198,21 @@ def add_arm(
     path: Path,
     gripper: viser.FrameHandle,
     links: Sequence[str],
+    bases: Sequence[str] = (),
 ) -> list[viser.GuiSliderHandle[float]]:
     """Add an arm at the robot base, and a slider for each joint, which are returned.
 
-    The node `gripper` moves with the first of `links` that the arm has.
+    The node `gripper` moves with the first of `links` that the arm has. The base is the first of
+    `bases` that it has, else its root.
     """
     model = RobotModel(path)  # reports what is wrong in the file
     optional_module("yourdfpy", "drawing an arm needs yourdfpy", "urdf")
     from viser.extras import ViserUrdf
 
     link = next((link for link in links if link in model.links), None)
-    server.scene.add_frame("/robot", show_axes=False)
+    root = model.base_link
+    base = next((link for link in bases if link in model.links), root)
+    robot = server.scene.add_frame("/robot", show_axes=False)
     try:
         shown = ViserUrdf(server, path, root_node_name="/robot")
     except Exception as error:  # trimesh raises many types for broken meshes
@@ -221,9 +226,10 @@ def add_arm(
     def move() -> None:
         values = np.array([slider.value for slider in sliders])
         shown.update_cfg(values)
+        pose_of = partial(model.poses, tuple(limits), values[None], base)
+        place(robot, pose_of(root).poses[0])
         if link is not None:
-            moved = model.poses(tuple(limits), values[None], None, link)
-            place(gripper, moved.poses[0])
+            place(gripper, pose_of(link).poses[0])
 
     with server.gui.add_folder("Arm", expand_by_default=False):
         for name, (low, high) in limits.items():

@@ -62,7 +62,8 @@ class Page:
             self._add_controls(given)
             if urdf is not None:
                 links = [c.parent_frame for c in given.values() if c.on_gripper]
-                drawing.add_arm(server, urdf, gripper, links)
+                bases = [one.frames.base for one in (*scenes, *given.values())]
+                drawing.add_arm(server, urdf, gripper, links, bases)
         except BaseException:
             self.close()
             raise

@@ -15,6 +15,7 @@ from evercal.recordings.poses.joint_tables import interpolate, poses_of_arm
 from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
+from evercal.robot.frame_names import FrameNames
 from evercal.robot.robot_model import RobotModel
 from evercal.typing import Array, BoolArray, IntArray, Strings
 
@@ -248,7 +249,9 @@ def poses_at_images(
             f"tf also has the camera ({camera_frame}), which is not used; to use it, give"
             f" `gripper_frame` {camera_frame}"
         )
-    return ImagePoses(RobotPoses(None, None, poses), valid, owner, notes)
+    names = FrameNames(base, "" if owner == "camera" else gripper)
+    stated = RobotPoses(None, None, poses, frames=names)
+    return ImagePoses(stated, valid, owner, notes)
 
 
 def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[_TfTree, Array]:
