@@ -1,6 +1,7 @@
 """Rigid transforms, poses with covariance and the camera model: numpy, float64, no I/O."""
 
 from evercal.geometry.averages import average_poses as average_poses
+from evercal.geometry.averages import spread as spread
 from evercal.geometry.camera import Camera as Camera
 from evercal.geometry.camera import resize_pixels as resize_pixels
 from evercal.geometry.se3 import SE3 as SE3

@@ -3,7 +3,7 @@
 import numpy as np
 
 from evercal.geometry.se3 import SE3, dominant_quaternion, pose_distance
-from evercal.typing import Array
+from evercal.typing import Array, IntArray
 
 
 def average_poses(poses: SE3) -> SE3:
@@ -34,10 +34,14 @@ def average_poses(poses: SE3) -> SE3:
     return mean
 
 
+def spread(count: int, most: int) -> IntArray:
+    """At most `most` of `count` rows, evenly spread, ascending."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(int)
+
+
 def _medoid(poses: SE3) -> SE3:
     """The pose with the smallest summed distance to the others, among at most 200 candidates."""
-    spread = np.linspace(0, len(poses) - 1, 200).round()
-    candidates = np.unique(spread.astype(int))
+    candidates = spread(len(poses), 200)
     cost = np.zeros(len(candidates))
     for distance in pose_distance(poses[candidates[:, None]], poses[None]):
         # Scaled by their median, distances in metres and in radians can be added.

@@ -80,6 +80,8 @@ class LearnedScenes:
         recording: PathLike | Recording,
         *,
         name: str | None = None,
+        base: str | None = None,
+        replace: str | None = None,
         memory: str | int | None = None,
         gripper_from_camera: SE3 | None = None,
         options: MapOptions | None = None,
@@ -94,6 +96,9 @@ class LearnedScenes:
             recording: a recording or its path. Training frames are learned; test frames are not
                 read.
             name: of the scene. Default: the recording's name.
+            base: name of the robot's base. Scenes of one place in one base give one answer.
+                Default: that of the recording, or none.
+            replace: name of a scene that the new one replaces: the room or the base was moved.
             memory: keyframes to keep: their number (20), a share of the frames ("10%"), a size
                 ("5MB"), or "auto" for the fewest that locate the recording's other frames well.
                 Default: 10 %, at least eight.
@@ -103,8 +108,8 @@ class LearnedScenes:
                 Default: bars on stderr.
 
         Raises:
-            InputError: A recording that cannot be used, a name that is taken, or another process
-                is writing into the map.
+            InputError: A recording that cannot be used, a name that is taken, poses that are not in
+                the base of this name, or another process is writing into the map.
         """
         from evercal.learning.scene import learn_scene
 
@@ -114,7 +119,7 @@ class LearnedScenes:
                 named, contents, memory, gripper_from_camera, options, step
             )
 
-        return self._add(recording, name, learned, on_progress)
+        return self._add(recording, name, learned, on_progress, (base, replace))
 
     def eye_to_hand(
         self,
@@ -159,22 +164,45 @@ class LearnedScenes:
         name: str | None,
         learned: Learn,
         on_progress: OnProgress | None,
+        in_map: tuple[str | None, str | None] = (None, None),
     ) -> LearnReport:
-        """Read and name a recording, learn it and store its scene."""
+        """Read and name a recording, learn it and store its scene.
+
+        `in_map` are the name of its base, and the scene that it replaces.
+        """
         from evercal.progress import shown
         from evercal.recordings import load_recording
         from evercal.recordings.held_out import named_recording
 
         if not isinstance(recording, Recording):
             recording = load_recording(recording)
-        recording = named_recording(recording, name, self.scenes)
+        base, replaced = in_map
+        if replaced is not None:
+            self._store.contents.scene(replaced)
+        taken = self._store.contents.without(replaced).names
+        recording = named_recording(recording, name, taken)
         with self._store.writing(), shown(on_progress) as step:
-            return self._commit(*learned(recording, step))
+            scene, report = learned(recording, step)
+            scene = replace(scene, base=base or recording.base or "")
+            return self._commit(scene, report, replaced)
 
-    def _commit(self, scene: SceneMap, report: LearnReport) -> LearnReport:
-        size = self._store.contents.with_scene(scene).memory_bytes
-        report = replace(report, memory_bytes=size)
-        self._store.commit(scene, report.stored())
+    def _commit(
+        self, scene: SceneMap, report: LearnReport, replaced: str | None = None
+    ) -> LearnReport:
+        from evercal.learning.mapped_already import mapped_already, placed
+        from evercal.localization.localizer import Localizer
+
+        kept = self._store.contents.without(replaced)
+        places = []
+        if kept.scenes:
+            places = mapped_already(Localizer(kept, self._options), scene)
+        scene = placed(scene, places)
+        report = replace(
+            report,
+            memory_bytes=kept.with_scene(scene).memory_bytes,
+            same_place=tuple(place.record for place in places),
+        )
+        self._store.commit(scene, report.stored(), replaced)
         self._changed()
         return report
 

@@ -4,10 +4,39 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Self
 
+from evercal.classes import frozen
 from evercal.mapping.built_map import Adjusted
 
 if TYPE_CHECKING:
     from evercal.calibration.from_map.hand_eye import HandEye
+
+
+@frozen
+class SamePlace:
+    """Another scene of the map that shows the place of a new one."""
+
+    scene: str
+    base: str
+    """Name of its base; empty where it has none."""
+    mm: float
+    """Median distance of cameras between both bases."""
+    deg: float
+    same_base: bool
+    """Whether both are in one base, to the uncertainty of both maps."""
+
+    @property
+    def distance(self) -> str:
+        """For people."""
+        return f"{self.mm:.1f} mm and {self.deg:.2f} deg"
+
+    @property
+    def warning(self) -> str:
+        """What it means for the answers."""
+        return (
+            f"this place is mapped as {self.scene}, in a base {self.distance} from that of the"
+            f" stated poses. Its images are ambiguous until `scene` names a scene. If the base was"
+            f" moved, replace the old scene: 'evercal map remove MAP {self.scene}'"
+        )
 
 
 @dataclass(frozen=True)
@@ -32,21 +61,28 @@ class LearnReport:
     """Changes by bundle adjustment; None for networks."""
     hand_eye: "HandEye | None" = None
     """The estimated camera on the gripper; None where the recording states camera poses."""
+    same_place: tuple[SamePlace, ...] = ()
+    """Scenes of the map that show the same place."""
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the map knows to be wrong about its recording."""
         from evercal.learning.stated_warnings import stated_warnings
 
-        if self.adjusted is None:
-            return ()
-        return tuple(stated_warnings(self.adjusted, self.hand_eye is None))
+        warnings = []
+        if self.adjusted is not None:
+            warnings += stated_warnings(self.adjusted, self.hand_eye is None)
+        for other in self.same_place:
+            if not other.same_base:
+                warnings.append(other.warning)
+        return tuple(warnings)
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON values, as `evercal learn --json` prints them."""
         values = dict(vars(self))
         values["adjusted"] = self.adjusted and asdict(self.adjusted)
         values["hand_eye"] = self.hand_eye and self.hand_eye.to_dict()
+        values["same_place"] = [asdict(other) for other in self.same_place]
         values["warnings"] = list(self.warnings)
         # Networks have others.
         values.setdefault("iterations", 0)
@@ -72,4 +108,5 @@ class LearnReport:
         if own["hand_eye"] is not None:
             calibration = Calibration.from_dict(values["calibration"])
             own["hand_eye"] = HandEye.from_dict(own["hand_eye"], calibration)
+        own["same_place"] = tuple(SamePlace(**row) for row in own["same_place"])
         return cls(**own)

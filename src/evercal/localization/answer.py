@@ -10,6 +10,7 @@ from evercal.localization import acceptance
 from evercal.localization.estimate import CovarianceTerm, PoseEstimate
 from evercal.localization.hypothesis import Aligned, Hypothesis, accepted
 from evercal.localization.lack_of_fit import WARPED, LackOfFit, lack_of_fit, unlikely
+from evercal.localization.other_bases import InBase
 from evercal.mapping.scene_map import SceneMap
 from evercal.typing import Array
 
@@ -79,10 +80,10 @@ def answer(
     scene: SceneMap,
     size: tuple[int, ...],
     milliseconds: float,
-    rival: Hypothesis | None = None,
+    rival: InBase | None = None,
     mirrored: float = 0.0,
 ) -> PoseEstimate:
-    """The answer for a pose in the map's frame, with another one that fits as well.
+    """The answer for a pose in the map's frame, or two if another one fits as well.
 
     `size` are height and width of the image; `mirrored` is the support of its mirror image.
     """
@@ -105,13 +106,13 @@ def answer(
     estimate, terms = in_base(best, scene, misfit)
     rejected = replace(rejected, parent_frame=scene.parent_frame)
     if rival is not None:
-        other = scene.frame.to_base(rival.pose).pose
         return replace(
             rejected,
             status="ambiguous",
-            reason=_rival_reason(estimate.pose, other, scene),
+            reason=_rival_reason(estimate.pose, rival, scene),
             scene=scene.name,
-            alternatives=(estimate.pose, other),
+            alternatives=(estimate.pose, rival.pose),
+            alternatives_in=(scene.name, rival.scene.name),
         )
     position_m = estimate.sigma_mm / 1000
     reason = _useless(best, misfit, position_m, mirrored, scene)
@@ -134,11 +135,16 @@ def answer(
     )
 
 
-def _rival_reason(pose: SE3, other: SE3, scene: SceneMap) -> str:
-    mm, deg = pose_distance_mm_deg(pose, other)
+def _rival_reason(pose: SE3, other: InBase, scene: SceneMap) -> str:
+    mm, deg = pose_distance_mm_deg(pose, other.pose)
     away = f"{deg:.1f} deg away"
     if scene.metric:
         away = f"{mm:.0f} mm, {away}"
+    if other.scene is not scene:
+        return (
+            f"ambiguous: {scene.name} and {other.scene.name} map this place in two bases, the pose"
+            f" in the second is {away}; name the scene with `scene`"
+        )
     return f"ambiguous: a second pose {away} fits equally well"
 
 

@@ -31,7 +31,8 @@ class PoseEstimate:
 
     status: Status
     """`uncertain`: the scene is known, but the pose is too uncertain to be useful, or the image is
-    not as a camera took it. `ambiguous`: two poses explain the image, see `alternatives`.
+    not as a camera took it. `ambiguous`: two poses explain the image, in one base or in several,
+    see `alternatives`.
     `unknown_scene`: no pose has enough support. `failed`: no pose."""
     reason: str
     """Why the status is not `ok`; empty otherwise."""
@@ -56,6 +57,10 @@ class PoseEstimate:
     """Shares that sum to the covariance; empty without alignment."""
     alternatives: tuple[SE3, ...] = ()
     """The poses base_from_camera of an ambiguous image, the stronger one first."""
+    alternatives_in: Strings = ()
+    """Their scenes: two where scenes map one place in several bases."""
+    base: str = ""
+    """Name of the base, or of the first scene in it where it has none."""
     omitted: Strings = ()
     """Steps that a time for the frame left out, see `TrackOptions.at_most_ms`."""
     parent_frame: str = "base"

@@ -4,7 +4,7 @@ from collections import OrderedDict
 from copy import copy
 from functools import cached_property
 from threading import Lock
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -23,6 +23,15 @@ ALIGNED_LEVELS = 2
 """Levels of the image pyramid that landmarks are aligned in."""
 _SAMPLED = 6
 """Every n-th landmark decides which keyframes see a view."""
+
+
+class Shown(NamedTuple):
+    """What a pose shows of a scene."""
+
+    keyframes: IntArray
+    """In the bank, those with most visible landmarks first."""
+    landmarks: int
+    """Visible landmarks, by a sample."""
 
 
 @frozen_arrays
@@ -175,6 +184,10 @@ class KeyframeBank:
 
     def seen(self, scene: int, pose: SE3, camera: Camera) -> IntArray:
         """Rank the keyframes of a scene by their landmarks that a pose map_from_camera shows."""
+        return self.shown(scene, pose, camera).keyframes
+
+    def shown(self, scene: int, pose: SE3, camera: Camera) -> Shown:
+        """The keyframes and landmarks of a scene that a pose map_from_camera shows."""
         surface_m, owner = self._sampled_landmarks(scene)
         inverse = pose.inverse()
         rotation = inverse.rotation_matrix()
@@ -183,7 +196,7 @@ class KeyframeBank:
         of_scene = np.flatnonzero(self.scene == scene)
         counts = np.bincount(owner[shown], minlength=len(of_scene))
         order = of_scene[np.argsort(-counts, kind="stable")]
-        return order[self._used[order]]
+        return Shown(order[self._used[order]], _SAMPLED * int(counts.sum()))
 
     def _sampled_landmarks(self, scene: int) -> tuple[Array, IntArray]:
         """Some landmarks of a scene as for `project_surface`, and their keyframes."""

@@ -4,6 +4,7 @@ The way of an image: prepare, encode, retrieve keyframes, match, PnP, align land
 """
 
 import time
+from collections.abc import Iterable
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from evercal.localization.intrinsics import (
 )
 from evercal.localization.keyframe_bank import KeyframeBank
 from evercal.localization.options import Attempt, LocalizeOptions
+from evercal.localization.other_bases import InBase, in_other_base
 from evercal.localization.query import Candidate, Encoded, Query
 from evercal.localization.rivals import settled
 from evercal.localization.scene_poses import ScenePoses
@@ -64,6 +66,10 @@ class Localizer:
                 f"store {store}: no scene learned yet; run 'evercal learn' first"
             )
         return cls(contents, options)
+
+    def within(self, names: Iterable[str]) -> Self:
+        """The same localizer with some of its scenes."""
+        return type(self)(self.contents.within(names), self.options)
 
     def only(self, scene: int, keyframes: IntArray) -> Self:
         """The same localizer with some keyframes of one scene."""
@@ -105,15 +111,19 @@ class Localizer:
         features = contents.encoder.encode(image, contents.short_side)
         query = replace(query, encoded=Encoded(features))
         best = self._best_hypothesis(query)
-        rival = None
+        other = None
         mirrored = 0.0
         if isinstance(best, Aligned) and accepted(best):
             best, rival = settled(self.poses, query, best)
+            if rival is None:
+                best, other = in_other_base(self.poses, query, best)
+            else:
+                other = InBase.of(contents.scenes[best.scene], rival)
             if not accepted(best, MIRRORED):
                 mirrored = self._mirrored_support(query)
         milliseconds = 1000 * (time.perf_counter() - began)
         scene = contents.scenes[0 if best is None else best.scene]
-        estimate = answer(best, scene, image.shape[:2], milliseconds, rival, mirrored)
+        estimate = answer(best, scene, image.shape[:2], milliseconds, other, mirrored)
         return estimate, best
 
     def query(self, image: Image, camera: Camera | None) -> Query:

@@ -1,7 +1,8 @@
 """`SceneMap`: the map of one scene as a robot keeps it, and the scenes of one map together."""
 
 import hashlib
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
-from evercal.geometry import Camera
+from evercal.geometry import SE3, Camera, pose_distance
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import MapFrame
 from evercal.robot.frame_names import UNKNOWN, FrameNames
@@ -45,6 +46,11 @@ class SceneMap:
     A map of unknown unit is normalised to the depths of a room."""
     frames: FrameNames = UNKNOWN
     """Names of the frames of the recording; `camera` is that of the camera that recorded it."""
+    base: str = ""
+    """Name of the robot's base, which scenes may share; empty where none was stated."""
+    places: Mapping[str, SE3] = field(default_factory=dict)
+    """place_from_base by place. Scenes of one place map the same surroundings, and those in one
+    base have the same pose there, see `learning.mapped_already`."""
 
     @property
     def metric(self) -> bool:
@@ -71,6 +77,11 @@ class SceneMap:
         return sum(map(len, self.keyframes.landmarks))
 
     @property
+    def place(self) -> str:
+        """Identifies the place of a scene that is the first one to map it."""
+        return hashlib.sha256(b"".join(self.keyframes.images)).hexdigest()[:16]
+
+    @property
     def digest(self) -> str:
         """Identifies the map and its base frame: poses with the same digest share their errors."""
         digest = hashlib.sha256(b"".join(self.keyframes.images))
@@ -80,6 +91,24 @@ class SceneMap:
             digest.update(similarity.base_from_map.matrix().tobytes())
             digest.update(np.float64(similarity.scale).tobytes())
         return digest.hexdigest()[:16]
+
+
+def base_from_other_base(scene: SceneMap, other: SceneMap) -> SE3 | None:
+    """Pose of another scene's base in the base of a scene; None if they share no place."""
+    shared = scene.places.keys() & other.places.keys()
+    for place in sorted(shared):
+        return scene.places[place].inverse() @ other.places[place]
+    return None
+
+
+def same_base(scene: SceneMap, other: SceneMap) -> bool:
+    """Whether two scenes are in one base: by name, or by their poses where one has no name."""
+    if scene.parent_frame != other.parent_frame:
+        return False
+    if scene.base and other.base:
+        return scene.base == other.base
+    between = base_from_other_base(scene, other)
+    return between is not None and max(pose_distance(between, SE3.identity())) < 1e-9
 
 
 @dataclass
@@ -115,6 +144,16 @@ class MapContents:
     def with_scene(self, scene: SceneMap) -> "MapContents":
         """The same map with one more scene."""
         return MapContents(self.encoder, self.short_side, [*self.scenes, scene])
+
+    def within(self, names: Iterable[str]) -> "MapContents":
+        """The same map with only some scenes."""
+        wanted = {self.scene(name).name for name in names}
+        scenes = [scene for scene in self.scenes if scene.name in wanted]
+        return replace(self, scenes=scenes)
+
+    def without(self, name: str | None) -> "MapContents":
+        """The same map without one scene, or with all of them."""
+        return self.within(other for other in self.names if other != name)
 
     def scene(self, name: str) -> SceneMap:
         """The map of a scene."""

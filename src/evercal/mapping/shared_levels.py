@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from evercal.classes import frozen_arrays
+from evercal.geometry import spread
 from evercal.robot.pose_errors import (
     FIRST_SHARED,
     WANTED,
@@ -91,16 +92,7 @@ def shared_levels(
         sigma: (6,) standard deviations of the prior that posterior and mean belong to.
         kinds: Kinds of errors that may be shared.
     """
-    n = len(errors)
-    judges = (
-        np.linspace(
-            0,
-            n - 1,
-            min(n, _MOST_JUDGES),
-        )
-        .round()
-        .astype(int)
-    )
+    judges = spread(len(errors), _MOST_JUDGES)
     flat = rows[:, judges].reshape(len(rows), -1)
     posterior = np.linalg.inv(flat.T @ flat)
     variance = sigma**2 / weight[judges, None]

@@ -120,9 +120,12 @@ class MapStore(StageStore[MapContents]):
             )
         return cls.open(root, encoder)
 
-    def commit(self, scene: SceneMap, report: Mapping[str, object]) -> None:
-        """Add a scene: whole, or not at all."""
-        if scene.name in self.contents.names:
+    def commit(
+        self, scene: SceneMap, report: Mapping[str, object], replaced: str | None = None
+    ) -> None:
+        """Add a scene, in the place of one that is removed or of none: whole, or not at all."""
+        names = self.contents.names
+        if scene.name != replaced and scene.name in names:
             raise InputError(
                 f"scene {scene.name!r}: map {self.root} has a scene of this name"
             )
@@ -134,8 +137,14 @@ class MapStore(StageStore[MapContents]):
             save_tensors(folder / KEYFRAMES, scene.keyframes.to_tensors())
             write_report(folder, report)
 
-        self.add(scene.name, write, self.payload)
-        self.contents.scenes.append(scene)
+        kept = [
+            stage
+            for stage, name in zip(self.stages, names, strict=True)
+            if name != replaced
+        ]
+        self.change(kept, [(scene.name, write)], self.payload)
+        # A localizer that still answers keeps the contents it was made with.
+        self.contents = self.contents.without(replaced).with_scene(scene)
 
     def update(self, scene: SceneMap) -> None:
         """Replace what is stored of a scene beside its keyframes: whole, or not at all.
@@ -257,6 +266,8 @@ def write_scene(folder: Path, scene: SceneMap) -> None:
         "frames": vars(scene.frames),
         "unit": scene.unit or 1.0,
         "intrinsics_sigma": list(scene.intrinsics_sigma),
+        "base": scene.base,
+        "places": {place: pose_to_dict(pose) for place, pose in scene.places.items()},
         "frame": frame_to_dict(scene.frame),
     }
     write_json(folder / SCENE, content)
@@ -320,6 +331,10 @@ def _read_scene(folder: Path) -> SceneMap:
         parent_frame=content.get("parent_frame", "base"),
         frames=FrameNames.from_dict(content.get("frames", {})),
         unit=unit,
+        base=str(content.get("base", "")),
+        places={
+            place: _pose_of(pose) for place, pose in content.get("places", {}).items()
+        },
     )
 
 

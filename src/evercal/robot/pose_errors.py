@@ -21,7 +21,7 @@ from scipy.linalg import block_diag, cho_solve, solve_triangular
 from scipy.optimize import minimize
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, pose_distance
+from evercal.geometry import SE3, pose_distance, spread
 from evercal.typing import Array, BoolArray, IntArray
 
 if TYPE_CHECKING:
@@ -194,14 +194,7 @@ def _effects(correlation: Array) -> Array:
 
     C. Williams and M. Seeger, Using the Nystroem method to speed up kernel machines, 2000.
     """
-    n = len(correlation)
-    count = min(n, _MOST_PLACES)
-    places = np.linspace(
-        0,
-        n - 1,
-        count,
-    )
-    places = places.round().astype(int)
+    places = spread(len(correlation), _MOST_PLACES)
     among = correlation[np.ix_(places, places)]
     values, axes = np.linalg.eigh(among)
     large = values > _LEAST_SHARE * values[-1]

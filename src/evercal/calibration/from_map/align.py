@@ -68,12 +68,11 @@ class MapAlignment:
 def _in_own_frame(localizer: "Localizer", name: str) -> "Localizer":
     from evercal.localization.localizer import Localizer
 
-    contents = localizer.contents
+    contents = localizer.contents.within([name])
     scene = contents.scene(name)
     frame = MapFrame(pose_sigma=scene.frame.pose_sigma)
-    scenes = list(contents.scenes)
-    scenes[scenes.index(scene)] = replace(scene, frame=frame)
-    return Localizer(replace(contents, scenes=scenes), localizer.options)
+    contents = contents.with_replaced(0, replace(scene, frame=frame))
+    return Localizer(contents, localizer.options)
 
 
 def align_by_gripper(

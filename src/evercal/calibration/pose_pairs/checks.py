@@ -18,7 +18,13 @@ from evercal.calibration.pose_pairs.fit import (
 from evercal.calibration.pose_pairs.pairs import BoardCorners, PosePairs
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation, Unknowns
 from evercal.errors import InputError
-from evercal.geometry import SE3, norms, pose_distance, pose_distance_mm_deg
+from evercal.geometry import (
+    SE3,
+    norms,
+    pose_distance,
+    pose_distance_mm_deg,
+    spread,
+)
 from evercal.recordings.poses.pairing import counted
 from evercal.storage.text_files import few
 from evercal.typing import IntArray
@@ -146,16 +152,7 @@ def require_rotations(
 
     The angles are root mean squares between two poses, about the main and the second axis.
     """
-    rows = (
-        np.linspace(
-            0,
-            len(base_from_gripper) - 1,
-            100,
-        )
-        .round()
-        .astype(int)
-    )
-    grippers = base_from_gripper[np.unique(rows)]
+    grippers = base_from_gripper[spread(len(base_from_gripper), 100)]
     i, j = np.triu_indices(len(grippers), 1)
     motions = grippers[i].inverse() @ grippers[j]
     rotations = 2.0 * motions.rotation_wxyz[:, 1:]

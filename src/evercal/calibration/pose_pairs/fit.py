@@ -18,7 +18,7 @@ from evercal.calibration.pose_pairs.noise_levels import (
 )
 from evercal.calibration.pose_pairs.pose_equation import PoseEquation, System, Unknowns
 from evercal.classes import frozen, frozen_arrays
-from evercal.geometry import norms
+from evercal.geometry import norms, spread
 from evercal.geometry.normal_equations import normal_solution
 from evercal.typing import Array, BoolArray
 
@@ -156,8 +156,7 @@ def robust_fit(
 def _judges(equation: PoseEquation, use: BoolArray) -> PoseEquation:
     """The used poses that estimate the noise: more of them cost much and tell little."""
     rows = np.flatnonzero(use)
-    count = min(len(rows), _MOST_JUDGES)
-    return equation[rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]]
+    return equation[rows[spread(len(rows), _MOST_JUDGES)]]
 
 
 def refine(

@@ -14,6 +14,7 @@ import numpy as np
 from evercal.calibration.pose_pairs.fit import Agreement, agreement
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation, Unknowns
+from evercal.geometry import spread
 from evercal.robot.mount import MountName
 from evercal.typing import Array, IntArray
 
@@ -49,16 +50,7 @@ class Start(NamedTuple):
 def consensus_start(equation: PoseEquation, scale_known: bool = True) -> Start:
     """Return the hypothesis that agrees best with the better half of three or more poses."""
     n = len(equation)
-    rows = (
-        np.linspace(
-            0,
-            n - 1,
-            _MAX_SCORED,
-        )
-        .round()
-        .astype(int)
-    )
-    scored = equation[np.unique(rows)]
+    scored = equation[spread(n, _MAX_SCORED)]
     a, b, c = _triples(n).T
     first = np.stack([a, a, b], 1)
     second = np.stack([b, c, c], 1)
