@@ -207,6 +207,7 @@ class Map(LearnedScenes):
         """
         from evercal.calibration.from_map.align import align_by_gripper, align_by_points
         from evercal.calibration.image_source import Images
+        from evercal.learning.mapped_already import placed
 
         with self._store.writing():
             own = self.localizer.contents.scene(scene)
@@ -225,7 +226,9 @@ class Map(LearnedScenes):
                     self.localizer, scene, given.images, poses, scale_known, boards
                 )
             frames = replace(own.frames, base=base_frame or "")
-            self._store.update(replace(found.applied_to(own), frames=frames))
+            aligned = replace(found.applied_to(own), frames=frames, places={})
+            others = self._store.contents.without(scene)
+            self._store.update(placed(aligned, others)[0])
         self._changed()
         return found
 

@@ -48,6 +48,8 @@ class ImagePose:
     """Pose to fuse: base_from_camera or gripper_from_camera. Identity if it was not located."""
     covariance: Array
     """(6, 6), as in `Calibration`."""
+    base: str = ""
+    """The first scene in the base of the image's scene."""
 
     @property
     def is_located(self) -> bool:
@@ -95,19 +97,25 @@ def locate(
     image estimates for itself.
     """
     located = []
+    contents = localizer.contents
     for name, image in images:
+        base = ""
         estimate = localize_picture(localizer, image, camera)
         uncertain = estimate.uncertain_pose
         own = estimate.camera
-        if uncertain is None:
+        if uncertain is None or estimate.scene is None:
             uncertain = UncertainPose(SE3.identity(), np.eye(6))
-        elif own is not None and estimate.scene is not None:
-            shape = np.empty((own.height, own.width), np.uint8)
-            scene = localizer.contents.scene(estimate.scene)
-            common = cameras_in_scenes(camera, shape, [scene])[0]
-            turn = fit_rays(own, common).own_from_other
-            uncertain = uncertain @ SE3.of(turn, np.zeros(3))
-        located.append(ImagePose(name, estimate, uncertain.pose, uncertain.covariance))
+        else:
+            base = contents.base_of(estimate.scene)
+            if own is not None:
+                shape = np.empty((own.height, own.width), np.uint8)
+                scene = contents.scene(estimate.scene)
+                common = cameras_in_scenes(camera, shape, [scene])[0]
+                turn = fit_rays(own, common).own_from_other
+                uncertain = uncertain @ SE3.of(turn, np.zeros(3))
+        located.append(
+            ImagePose(name, estimate, uncertain.pose, uncertain.covariance, base)
+        )
         on_image()
     return located
 
@@ -123,7 +131,7 @@ def in_parent_frame(
     moved = []
     for item, parent in zip(located, parent_from_scene, strict=True):
         pose = parent @ UncertainPose(item.pose, item.covariance)
-        moved.append(ImagePose(item.name, item.estimate, pose.pose, pose.covariance))
+        moved.append(replace(item, pose=pose.pose, covariance=pose.covariance))
     return moved
 
 
@@ -160,23 +168,27 @@ def shows_held_thing(
 def fuse(located: Sequence[ImagePose]) -> Fused:
     """Fuse poses of one transform, with a reason for every image that is rejected."""
     names = Counter()
+    bases = Counter()
     for item in located:
+        if len({*item.estimate.alternatives_in}) > 1:
+            raise InputError(f"{item.name}: {item.estimate.reason}")
         if item.is_located:
-            names[item.estimate.scene] += 1
+            names[item.base, item.estimate.scene] += 1
+            bases[item.base] += 1
     if not names:
         first = located[0].estimate.reason if located else "no image was given"
         raise InputError(
             f"0 of {len(located)} images were located (the first: {first}); give sharp, well-lit"
             " images of a mapped scene"
         )
-    scene = max(names, key=lambda name: (names[name], str(name)))
+    base, scene = max(names, key=lambda name: (bases[name[0]], names[name], str(name)))
     reasons = [""] * len(located)
     for i, item in enumerate(located):
         if not item.is_located:
             reasons[i] = (
                 f"{item.estimate.status.replace('_', ' ')}: {item.estimate.reason}"
             )
-        elif item.estimate.scene != scene:
+        elif item.base != base:
             reasons[i] = f"shows scene {item.estimate.scene}; most images show {scene}"
     usable = [i for i, reason in enumerate(reasons) if not reason]
     poses = SE3.stack([located[i].pose for i in usable])

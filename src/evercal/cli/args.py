@@ -8,13 +8,14 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TextIO
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from evercal.bounds import VARIABLE, bounds
 from evercal.classes import frozen
 from evercal.cli.console import print_json, print_next, say
 from evercal.errors import InputError
 from evercal.processes import cores
+from evercal.typing import Strings
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
@@ -41,6 +42,15 @@ File = Annotated[Path | None, shown("FILE")]
 Folder = Annotated[Path | None, shown("DIR")]
 Name = Annotated[str | None, shown("NAME")]
 Frame = Annotated[str | None, shown("FRAME")]
+Scenes = Annotated[
+    tuple[str, ...],
+    UseAppendAction,
+    shown(
+        "NAME",
+        "(default: all)",
+        help="Locate images in this scene only; repeat it for several.",
+    ),
+]
 Source = Annotated[str | None, shown("SOURCE")]
 Topic = Annotated[str | None, shown("TOPIC")]
 Seconds = Annotated[float | None, shown("SECONDS")]
@@ -254,21 +264,23 @@ def strategy_of(store: Path) -> str | None:
     return str(read_manifest(store)["strategy"])
 
 
-def open_localizer(store: Path, device: str = "auto") -> "LearnedLocalizer":
+def open_localizer(
+    store: Path, device: str = "auto", scenes: Strings = ()
+) -> "LearnedLocalizer":
     """The localizer of a map, or of a store of networks on a device."""
     if strategy_of(store) in (MAP, None):
         if device != "auto":
             raise InputError(
                 f"--device {device}: a map needs no device; omit the option"
             )
-        return open_map(store)
+        return open_map(store, scenes)
     from evercal.continual.localizer import open_networks
 
     return open_networks(store, device)
 
 
-def open_map(store: Path) -> "Localizer":
-    """The localizer of a map; a store of networks is refused."""
+def open_map(store: Path, scenes: Strings = ()) -> "Localizer":
+    """The localizer of some scenes of a map, or of all; a store of networks is refused."""
     strategy = strategy_of(store)
     if strategy not in (MAP, None):
         raise InputError(
@@ -277,7 +289,8 @@ def open_map(store: Path) -> "Localizer":
         )
     from evercal.localization.localizer import Localizer
 
-    return Localizer.open(store)
+    localizer = Localizer.open(store)
+    return localizer.within(scenes) if scenes else localizer
 
 
 class Point(NamedTuple):

@@ -26,6 +26,7 @@ class Audit(args.Verb):
     or a 4x4 matrix base_from_camera.txt."""
     calibration: args.File = None
     """Pose of the camera in episodes that state none themselves."""
+    scene: args.Scenes = ()
     images: args.Number = 5
     """Images per episode that are located."""
     most_mm: Annotated[float, arg(metavar="MM")] = 5.0
@@ -42,7 +43,7 @@ class Audit(args.Verb):
 
         stated = args.transform_of(self.calibration)
         total = len(episode_folders(self.folder))
-        localizer = args.open_map(self.store)
+        localizer = args.open_map(self.store, self.scene)
         most = (self.most_mm, self.most_deg)
         with progress_bar("episodes", total, "episode") as bar:
             episodes = audit(

@@ -44,6 +44,7 @@ class Calibrate(args.Verb):
     mount: Annotated[MountName | None, args.shown("eye_to_hand|eye_in_hand")] = None
     """eye_to_hand for a fixed camera, eye_in_hand for one on the gripper. Default: decided from
     the camera's motion."""
+    scene: args.Scenes = ()
     camera: args.File = None
     """Intrinsics of these images. Default: those of the camera that recorded the scene."""
     frames: args.HowNamed = field(default_factory=args.Named)
@@ -61,7 +62,9 @@ class Calibrate(args.Verb):
         if folders:
             return self._rig(folders, point)
         images = self._taken(image_files(self.images))
-        calibration = self._calibrated(args.open_map(self.store), images, self.mount)
+        calibration = self._calibrated(
+            args.open_map(self.store, self.scene), images, self.mount
+        )
         calibration.write(self.out)
         self.answer(
             {**calibration.to_dict(), **at_record(calibration, point)},
@@ -115,7 +118,7 @@ class Calibrate(args.Verb):
         from evercal.calibration.calibration import rig_of
         from evercal.recordings.image_files import image_files
 
-        localizer = args.open_map(self.store)
+        localizer = args.open_map(self.store, self.scene)
         cameras = {}
         for name, folder in folders.items():
             images = self._taken(image_files([folder]))

@@ -41,6 +41,7 @@ class Check(args.Verb):
     """base_from_gripper of every image, where the scene is a thing in the gripper."""
     convention: args.Name = None
     """Format of the robot poses, if the file does not state it."""
+    scene: args.Scenes = ()
     camera: args.File = None
     """Intrinsics. Default: those of the reference, or of the recording."""
     urdf: args.File = None
@@ -62,7 +63,7 @@ class Check(args.Verb):
         files = image_files(self.images)
         camera = args.camera_for(self.camera, files)
         given = Images.of(files, camera, self.robot_poses, self.convention)
-        localizer = args.open_map(self.store)
+        localizer = args.open_map(self.store, self.scene)
         with progress_bar("localizing", len(given.images), "image") as bar:
             shift = check(
                 localizer,

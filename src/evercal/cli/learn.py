@@ -66,6 +66,11 @@ class Learn(args.Verb):
     """Folders of recordings, files of bags, or addresses such as s3://bucket/folder."""
     name: args.Name = None
     """Name of the scene. Default: the recording's own name."""
+    base: args.Name = None
+    """Name of the robot's base. Scenes of one place in one base give one answer; without a name,
+    learning compares their poses."""
+    replace: args.Name = None
+    """Name of a scene that the new one replaces: the room or the base was moved."""
     memory: Annotated[str | None, args.shown("SHARE|BYTES|auto")] = None
     """Keyframes to keep: a share of the frames (10%), a size (5MB), or auto for the fewest that
     locate the recording's other frames well. Default: 10%, at least eight."""
@@ -129,7 +134,7 @@ class Learn(args.Verb):
 
     def _run_many(self, strategy: str) -> int:
         why = "is for one recording, without --ray, --results and addresses; omit one of them"
-        self._refuse(why, "name", "calibration", "gripper_from_camera")
+        self._refuse(why, "name", "replace", "calibration", "gripper_from_camera")
         if strategy != args.MAP:
             raise InputError(
                 "a network learns one recording of this machine; give one folder"
@@ -156,6 +161,7 @@ class Learn(args.Verb):
                 workers=self.workers,
                 ray=self.ray,
                 results=self.results,
+                base=self.base,
                 memory=self.memory,
                 on_scene=show,
                 on_progress=bars.step,
@@ -197,6 +203,8 @@ class Learn(args.Verb):
             cell = Map.open(self.store, encoder=self.encoder)
             report = cell.learn(
                 recording,
+                base=self.base,
+                replace=self.replace,
                 memory=self.memory,
                 gripper_from_camera=rough,
                 options=MapOptions(errors=self.which.errors()),
@@ -298,6 +306,9 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
         if report.landmarks < FEW_LANDMARKS * report.frames_kept:
             few = f"{report.landmarks / report.frames_kept:.0f} landmarks a keyframe are few"
             yield f"warning: {few}: most images will be refused; record sharper and textured views"
+    for other in report.same_place:
+        if other.same_base:
+            yield other.agreement
     yield from map("warning: {}".format, report.warnings)
     found = report.hand_eye
     if found is not None:

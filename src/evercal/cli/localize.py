@@ -39,6 +39,7 @@ class Localize(args.Verb):
     store: args.Store
     images: args.ImageFiles
     """Image files or folders of them."""
+    scene: args.Scenes = ()
     camera: args.File = None
     """Intrinsics: 3x3 matrix as text, JSON, YAML, NPZ, ROS camera_info or OpenCV's storage.
     Default: those of the camera that recorded the scene."""
@@ -62,7 +63,7 @@ class Localize(args.Verb):
 
             require_writable(self.video, "--video")
             require_ending(self.video)
-        localizer = args.open_localizer(self.store, self.device)
+        localizer = args.open_localizer(self.store, self.device, self.scene)
         # All of them before the first is printed.
         answers = self._answers(localizer, files, camera)
         records = []
@@ -75,7 +76,11 @@ class Localize(args.Verb):
             self._animate(self.video, localizer, answers)
             lines.append(f"wrote {self.video}")
         located = any(answer.estimate.status == "ok" for answer in answers)
-        if not located:
+        two_bases = [a.estimate for a in answers if a.estimate.alternatives_in]
+        if two_bases:
+            scene = two_bases[0].alternatives_in[0]
+            then = ("localize", self.store, files[0], "--scene", scene)
+        elif not located:
             then = ("learn", self.store, "RECORDING")
         elif self.overlay is None:
             then = ("localize", self.store, files[0], "--overlay", "DIR")
@@ -163,7 +168,7 @@ def _lines(answer: Answer, point: args.Point | None) -> Iterator[str]:
     if estimate.parent_frame == "gripper":
         note = " (a thing in the gripper: the pose is gripper_from_camera)"
     if estimate.scene is not None:
-        yield f"  scene        {estimate.scene}{note}"
+        yield f"  scene        {estimate.scene_in_words}{note}"
     if pose is None:
         yield f"  {estimate.status.replace('_', ' ')}: {estimate.reason}"
         yield inliers

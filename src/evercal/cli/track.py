@@ -37,6 +37,7 @@ class Track(args.Verb):
     """Number (0) or device of a camera, an address (rtsp://...), a video file or a folder."""
     out: Annotated[tuple[Path, ...], args.shown("FILE...", "(default: none)")] = ()
     """Files to write: .jsonl (JSON lines), .tum or .txt (TUM)."""
+    scene: args.Scenes = ()
     camera: args.File = None
     """Intrinsics. Default: those of the camera that recorded the scene."""
     at_most: Annotated[float | None, args.shown("MS")] = None
@@ -66,7 +67,7 @@ class Track(args.Verb):
         states: Counter[str] = Counter()
         times: list[float] = []
         with source as frames, ExitStack() as stack:
-            localizer = args.open_map(self.store)
+            localizer = args.open_map(self.store, self.scene)
             files = [stack.enter_context(TrackFile(path)) for path in self.out]
             try:
                 for name, stamp, image, _ in frames:

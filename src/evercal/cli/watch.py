@@ -47,6 +47,7 @@ class Watch(args.Verb):
     """Interval between scans of the folder."""
     idle: args.Seconds = None
     """Stop with exit code 0 after this time without a new image. Default: never."""
+    scene: args.Scenes = ()
     camera: args.File = None
     """Intrinsics. Default: those of the reference."""
 
@@ -62,7 +63,7 @@ class Watch(args.Verb):
         from evercal.calibration.located import ImagePose, fuse, locate
 
         reference = read_calibration(self.reference)
-        localizer = args.open_map(self.store)
+        localizer = args.open_map(self.store, self.scene)
         recent: deque[ImagePose] = deque(maxlen=self.window)
         arrivals = Arrivals(self.folder)
         tests = 0

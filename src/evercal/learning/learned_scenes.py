@@ -8,9 +8,10 @@ that a robot that only locates images loads no module that learns.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from copy import copy
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from evercal.errors import InputError
 from evercal.mapping.store import MapStore
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from evercal.mapping.build import MapOptions
     from evercal.mapping.manage import Merged, OnClash
     from evercal.mapping.refresh import RefreshOptions
-    from evercal.mapping.scene_map import SceneMap
+    from evercal.mapping.scene_map import MapContents, SceneMap
     from evercal.progress import OnProgress
     from evercal.robot.pose_errors import ArmErrors
 
@@ -46,7 +47,20 @@ class LearnedScenes:
     def __init__(self, store: MapStore, options: LocalizeOptions | None = None):
         self._store = store
         self._options = options
+        self._within: Strings = ()
         self._localizer: Localizer | None = None
+
+    def within(self, *scenes: str) -> Self:
+        """The same map, whose images are located in some of its scenes only.
+
+        Raises:
+            InputError: No such scene.
+        """
+        restricted = copy(self)
+        restricted._within = scenes
+        restricted._changed()
+        self._store.contents.within(scenes)
+        return restricted
 
     @property
     def path(self) -> Path:
@@ -73,6 +87,8 @@ class LearnedScenes:
                     f"map {self.path}: no scene learned yet; run 'evercal learn'"
                 )
             self._localizer = Localizer(self._store.contents, self._options)
+            if self._within:
+                self._localizer = self._localizer.within(self._within)
         return self._localizer
 
     def learn(
@@ -189,19 +205,12 @@ class LearnedScenes:
     def _commit(
         self, scene: SceneMap, report: LearnReport, replaced: str | None = None
     ) -> LearnReport:
-        from evercal.learning.mapped_already import mapped_already, placed
-        from evercal.localization.localizer import Localizer
+        from evercal.learning.mapped_already import placed
 
         kept = self._store.contents.without(replaced)
-        places = []
-        if kept.scenes:
-            places = mapped_already(Localizer(kept, self._options), scene)
-        scene = placed(scene, places)
-        report = replace(
-            report,
-            memory_bytes=kept.with_scene(scene).memory_bytes,
-            same_place=tuple(place.record for place in places),
-        )
+        scene, same_place = placed(scene, kept)
+        size = kept.with_scene(scene).memory_bytes
+        report = replace(report, memory_bytes=size, same_place=same_place)
         self._store.commit(scene, report.stored(), replaced)
         self._changed()
         return report
@@ -214,6 +223,7 @@ class LearnedScenes:
         workers: int = 2,
         ray: str | None = None,
         results: PathLike | None = None,
+        base: str | None = None,
         memory: str | int | None = None,
         options: MapOptions | None = None,
         on_scene: Callable[[LearnReport], object] = lambda _: None,
@@ -232,6 +242,7 @@ class LearnedScenes:
                 `ray://HOST:PORT`. All its machines reach the paths.
             results: Folder or address where every learned scene is kept, so that the same call
                 goes on where another one was stopped.
+            base: Name of the robot's base in all of them, as for `learn`.
             memory: Keyframes of each scene, as for `learn`.
             options: Sizes and priors of the map.
             on_scene: Called after each scene was added.
@@ -262,7 +273,8 @@ class LearnedScenes:
                 if learned.scene is None or learned.report is None:
                     failed.append(f"{sources[learned.number].name} ({learned.error})")
                     continue
-                reports.append(self._commit(learned.scene, learned.report))
+                scene = replace(learned.scene, base=base or "")
+                reports.append(self._commit(scene, learned.report))
                 on_scene(reports[-1])
         many.refuse_failures(failed, len(failed) + len(reports))
         return tuple(reports)
@@ -353,9 +365,13 @@ class LearnedScenes:
             InputError: Not a map, another encoder or image size, a name that is taken, or another
                 process writes into the map.
         """
+        from evercal.learning.mapped_already import placed
         from evercal.mapping.manage import merge_maps
 
-        merged = merge_maps(self._store, others, on_clash)
+        def place(scene: SceneMap, contents: MapContents) -> SceneMap:
+            return placed(scene, contents)[0]
+
+        merged = merge_maps(self._store, others, on_clash, place)
         self._changed()
         return merged
 

@@ -1,6 +1,6 @@
 """Whether the place of a new scene is mapped already, and where the other scene has its base."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -19,7 +19,8 @@ from evercal.geometry import (
 from evercal.learning.report import SamePlace
 from evercal.localization.acceptance import APART_M, APART_RAD, APART_SIGMAS
 from evercal.localization.localizer import Localizer
-from evercal.mapping.scene_map import SceneMap
+from evercal.localization.options import LocalizeOptions
+from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.typing import Image
 
 VIEWS = 8
@@ -37,7 +38,7 @@ SAME_RAD = np.deg2rad(0.1)
 
 
 @frozen_arrays
-class MappedAlready:
+class _Relation:
     """Another scene of the same place."""
 
     scene: SceneMap
@@ -58,19 +59,49 @@ class MappedAlready:
         )
 
 
-def mapped_already(localizer: Localizer, scene: SceneMap) -> list[MappedAlready]:
-    """The scenes of a map that show the place of another scene, which is not among them."""
+def placed(
+    scene: SceneMap, contents: MapContents
+) -> tuple[SceneMap, tuple[SamePlace, ...]]:
+    """A new scene in the places that a map shows already, or in one of its own; and its scenes.
+
+    Raises:
+        InputError: The poses of a scene in the base of this name are far from its poses.
+    """
+    if scene.places.keys() & {place for o in contents.scenes for place in o.places}:
+        return scene, ()
+    places: dict[str, SE3] = {}
+    others = []
+    for other in _mapped_already(contents, scene):
+        record = other.record
+        far = other.metres > APART_M or other.radians > APART_RAD
+        if far and not other.same and scene.base and scene.base == record.base:
+            raise InputError(
+                f"scene {scene.name!r}: {record.distance} from the poses of {record.scene} in base"
+                f" {scene.base!r}: the base was moved (`replace`), or it is another one (`base`)"
+            )
+        others.append(record)
+        for place, place_from_other in _places(other.scene).items():
+            pose = place_from_other
+            if not other.same:
+                pose = place_from_other @ other.other_from_base
+            places.setdefault(place, pose)
+    return replace(scene, places=places or _places(scene)), tuple(others)
+
+
+def _mapped_already(contents: MapContents, scene: SceneMap) -> list[_Relation]:
+    if not contents.scenes:
+        return []
+    # The first attempt finds what a recording of the same place shows.
+    options = LocalizeOptions(attempts=LocalizeOptions().attempts[:1])
+    localizer = Localizer(contents, options)
     shown: set[str] = set()
     for view in _views(scene):
         estimate = localizer.localize(*view.image)
         shown.update(estimate.alternatives_in)
-        if estimate.scene is not None:
-            shown.add(estimate.scene)
-    places = {
-        place for name in shown for place in places_of(localizer.contents.scene(name))
-    }
+        shown.update([estimate.scene] if estimate.scene else [])
+    places = {place for name in shown for place in _places(contents.scene(name))}
     found = []
-    for other in localizer.contents.scenes:
+    for other in contents.scenes:
         near = other.name in shown or places & other.places.keys()
         if near and other.parent_frame == scene.parent_frame:
             relation = _relation(localizer.within([other.name]), scene, other)
@@ -78,31 +109,7 @@ def mapped_already(localizer: Localizer, scene: SceneMap) -> list[MappedAlready]
     return found
 
 
-def placed(scene: SceneMap, others: Sequence[MappedAlready]) -> SceneMap:
-    """A scene in the places that other scenes map, or in a place of its own.
-
-    Raises:
-        InputError: The poses of a scene in the base of this name are far from its poses.
-    """
-    for other in others:
-        far = other.metres > APART_M or other.radians > APART_RAD
-        if scene.base and other.scene.base == scene.base and far and not other.same:
-            raise InputError(
-                f"scene {scene.name!r}: {other.record.distance} from the poses of"
-                f" {other.scene.name} in base {scene.base!r}: the base was moved (`replace`), or it"
-                " is another one (`base`)"
-            )
-    places: dict[str, SE3] = {}
-    for other in others:
-        for place, place_from_other in places_of(other.scene).items():
-            pose = place_from_other
-            if not other.same:
-                pose = place_from_other @ other.other_from_base
-            places.setdefault(place, pose)
-    return replace(scene, places=places or places_of(scene))
-
-
-def places_of(scene: SceneMap) -> Mapping[str, SE3]:
+def _places(scene: SceneMap) -> Mapping[str, SE3]:
     """place_from_base by place; maps that earlier versions wrote are in a place of their own."""
     return scene.places or {scene.place: SE3.identity()}
 
@@ -123,7 +130,7 @@ def _views(scene: SceneMap) -> Iterator[_View]:
 
 def _relation(
     localizer: Localizer, scene: SceneMap, other: SceneMap
-) -> MappedAlready | None:
+) -> _Relation | None:
     """Where another scene has its base, if enough views of a scene agree on that."""
     pairs = []
     for view in _views(scene):
@@ -147,4 +154,4 @@ def _relation(
     far_m, far_rad = np.median(distances, 0)
     near = far_m < SAME_M and far_rad < SAME_RAD
     same = near or np.median(squares) < APART_SIGMAS**2
-    return MappedAlready(other, other_from_base, far_m, far_rad, bool(same))
+    return _Relation(other, other_from_base, far_m, far_rad, bool(same))

@@ -30,6 +30,11 @@ class SamePlace:
         return f"{self.mm:.1f} mm and {self.deg:.2f} deg"
 
     @property
+    def agreement(self) -> str:
+        """That both scenes are in one base."""
+        return f"this place is mapped as {self.scene} too, in the same base ({self.distance} apart)"
+
+    @property
     def warning(self) -> str:
         """What it means for the answers."""
         return (

@@ -104,7 +104,7 @@ def answer(
         return replace(rejected, reason=rejection(best, scene))
     misfit = _misfit(best)
     estimate, terms = in_base(best, scene, misfit)
-    rejected = replace(rejected, parent_frame=scene.parent_frame)
+    rejected = replace(rejected, parent_frame=scene.parent_frame, base=scene.base)
     if rival is not None:
         return replace(
             rejected,
@@ -142,7 +142,7 @@ def _rival_reason(pose: SE3, other: InBase, scene: SceneMap) -> str:
         away = f"{mm:.0f} mm, {away}"
     if other.scene is not scene:
         return (
-            f"ambiguous: {scene.name} and {other.scene.name} map this place in two bases, the pose"
+            f"{scene.name} and {other.scene.name} map this place in two bases, the pose"
             f" in the second is {away}; name the scene with `scene`"
         )
     return f"ambiguous: a second pose {away} fits equally well"

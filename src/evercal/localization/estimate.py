@@ -60,7 +60,7 @@ class PoseEstimate:
     alternatives_in: Strings = ()
     """Their scenes: two where scenes map one place in several bases."""
     base: str = ""
-    """Name of the base, or of the first scene in it where it has none."""
+    """Name of the base; empty where the scene has none."""
     omitted: Strings = ()
     """Steps that a time for the frame left out, see `TrackOptions.at_most_ms`."""
     parent_frame: str = "base"
@@ -82,6 +82,13 @@ class PoseEstimate:
             0.0,
             milliseconds,
         )
+
+    @property
+    def scene_in_words(self) -> str:
+        """The scene and its base."""
+        if self.base:
+            return f"{self.scene}, base {self.base}"
+        return str(self.scene)
 
     @property
     def uncertain_pose(self) -> UncertainPose | None:

@@ -152,8 +152,14 @@ class KeyframeBank:
     def only(self, keyframes: IntArray) -> Self:
         """The same bank with these keyframes in use; they are loaded once for both."""
         restricted = copy(self)
-        restricted._used = np.isin(np.arange(len(self.scene)), keyframes)
+        vars(restricted).pop("scenes", None)
+        restricted._used = np.isin(np.arange(len(self.scene)), keyframes) & self._used
         return restricted
+
+    @cached_property
+    def scenes(self) -> frozenset[int]:
+        """Scenes with keyframes in use."""
+        return frozenset(self.scene[self._used].tolist())
 
     @property
     def encoder(self) -> Encoder:

@@ -68,13 +68,18 @@ class Localizer:
         return cls(contents, options)
 
     def within(self, names: Iterable[str]) -> Self:
-        """The same localizer with some of its scenes."""
-        return type(self)(self.contents.within(names), self.options)
+        """The same localizer that locates images in some scenes only."""
+        wanted = self.contents.within(names).names
+        numbers = [self.contents.names.index(name) for name in wanted]
+        return self._with(np.flatnonzero(np.isin(self.poses.bank.scene, numbers)))
 
     def only(self, scene: int, keyframes: IntArray) -> Self:
         """The same localizer with some keyframes of one scene."""
-        bank = self.poses.bank
-        bank = bank.only(np.flatnonzero(bank.scene == scene)[keyframes])
+        of_scene = np.flatnonzero(self.poses.bank.scene == scene)
+        return self._with(of_scene[keyframes])
+
+    def _with(self, keyframes: IntArray) -> Self:
+        bank = self.poses.bank.only(keyframes)
         restricted = copy(self)
         restricted.poses = ScenePoses(self.contents, bank, self.options)
         return restricted

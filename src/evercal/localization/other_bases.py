@@ -59,7 +59,8 @@ def in_other_base(
     scenes = poses.contents.scenes
     own = InBase.of(scenes[best.scene], best)
     views = [own]
-    for number, scene in enumerate(scenes):
+    for number in sorted(poses.bank.scenes):
+        scene = scenes[number]
         between = base_from_other_base(scene, own.scene)
         if between is not None and not same_base(scene, own.scene):
             views.append(_in_base(poses, query, number, between @ own.pose))

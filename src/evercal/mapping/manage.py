@@ -6,7 +6,7 @@ last complete state.
 
 import hashlib
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import field, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,14 @@ from evercal.classes import frozen, frozen_arrays
 from evercal.errors import InputError
 from evercal.features.encoder import read_network
 from evercal.mapping.scene_map import MapContents, SceneMap
-from evercal.mapping.store import PREVIOUS, SCENE, MapStore, read_scenes, require_map
+from evercal.mapping.store import (
+    PREVIOUS,
+    SCENE,
+    MapStore,
+    read_scenes,
+    require_map,
+    write_scene,
+)
 from evercal.recordings.frame import checked_name
 from evercal.storage.archive import (
     check_archive,
@@ -131,6 +138,7 @@ def merge_maps(
     store: MapStore,
     others: Sequence[PathLike],
     on_clash: OnClash = "refuse",
+    place: Callable[[SceneMap, MapContents], SceneMap] = lambda scene, _: scene,
 ) -> Merged:
     """Add the scenes of other maps to a map, all in one step.
 
@@ -142,6 +150,7 @@ def merge_maps(
         others: Folders of the other maps; they do not change.
         on_clash: For names that are taken: `refuse`; `rename` to NAME-2; `skip` the new scene;
             `replace` the scene of the map.
+        place: Relates a new scene to those before it.
     """
     if on_clash not in get_args(OnClash):
         raise InputError(
@@ -178,6 +187,7 @@ def merge_maps(
             contents,
             networks,
             roots[0],
+            place,
         )
     return Merged(
         tuple(merge.incoming),
@@ -318,6 +328,7 @@ def _commit(
     contents: MapContents,
     networks: Manifest | None,
     source: Path,
+    place: Callable[[SceneMap, MapContents], SceneMap],
 ) -> None:
     """Write a merged map. A new one also gets the networks of the first map, `source`."""
 
@@ -337,16 +348,19 @@ def _commit(
                 _copy(item.root, file, item.manifest, target)
         if name != item.scene.name:
             _write_name(folder, name)
+        write_scene(folder, grown.scene(name))
 
     added = []
-    scenes = [contents.scenes[i] for i in merge.kept.values()]
+    kept = [contents.scenes[i] for i in merge.kept.values()]
+    grown = replace(contents, scenes=kept)
     for name, item in merge.incoming.items():
         added.append((name, partial(copy, name, item)))
-        scenes.append(replace(item.scene, name=name))
+        scene = place(replace(item.scene, name=name), grown)
+        grown = grown.with_scene(scene)
     stages = [store.stages[i] for i in merge.kept.values()]
     payload = {**store.payload, "short_side": contents.short_side}
     store.change(stages, added, payload)
-    store.contents = replace(contents, scenes=scenes)
+    store.contents = grown
 
 
 def _copy(

@@ -108,7 +108,9 @@ def same_base(scene: SceneMap, other: SceneMap) -> bool:
     if scene.base and other.base:
         return scene.base == other.base
     between = base_from_other_base(scene, other)
-    return between is not None and max(pose_distance(between, SE3.identity())) < 1e-9
+    if between is None:
+        return scene is other
+    return bool(max(pose_distance(between, SE3.identity())) < 1e-9)
 
 
 @dataclass
@@ -150,6 +152,12 @@ class MapContents:
         wanted = {self.scene(name).name for name in names}
         scenes = [scene for scene in self.scenes if scene.name in wanted]
         return replace(self, scenes=scenes)
+
+    def base_of(self, name: str) -> str:
+        """The first scene in the base of a scene."""
+        own = self.scene(name)
+        alike = (other.name for other in self.scenes if same_base(other, own))
+        return next(alike, name)
 
     def without(self, name: str | None) -> "MapContents":
         """The same map without one scene, or with all of them."""

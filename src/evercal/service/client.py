@@ -60,7 +60,10 @@ class Client:
         return tuple(self._ask("GET", "/scenes")["scenes"])
 
     def localize(
-        self, image: np.ndarray | PathLike, camera: Camera | None = None
+        self,
+        image: np.ndarray | PathLike,
+        camera: Camera | None = None,
+        scenes: Strings = (),
     ) -> PoseEstimate:
         """Estimate the camera pose of one image, see `Map.localize`.
 
@@ -69,6 +72,7 @@ class Client:
         parts: Parts = [
             ("image", _image_part(image, "image.png")),
             *_json_part("camera", camera),
+            *_scene_parts(scenes),
         ]
         return _estimate(self._ask("POST", "/localize", parts))
 
@@ -79,11 +83,13 @@ class Client:
         robot_poses: PathLike | SE3 | None = None,
         camera: Camera | None = None,
         mount: MountName | None = None,
+        scenes: Strings = (),
     ) -> Calibration:
         """Calibrate a camera from its images, see `Map.calibrate`."""
         parts = _image_parts(images, robot_poses, camera)
         if mount is not None:
             parts.append(("mount", mount))
+        parts += _scene_parts(scenes)
         return Calibration.from_dict(self._ask("POST", "/calibrations", parts))
 
     def check(
@@ -93,6 +99,7 @@ class Client:
         *,
         robot_poses: PathLike | SE3 | None = None,
         camera: Camera | None = None,
+        scenes: Strings = (),
     ) -> "Shift":
         """Test whether a fixed camera has moved, see `Map.check`.
 
@@ -102,6 +109,7 @@ class Client:
 
         parts = _image_parts(images, robot_poses, camera)
         parts += _json_part("calibration", calibration)
+        parts += _scene_parts(scenes)
         record = self._ask("POST", "/check", parts)
         record.pop("images")
         left_out = tuple(ImageUse(**use) for use in record.pop("left_out"))
@@ -127,6 +135,10 @@ class Client:
         if isinstance(content, dict):
             message = content.get("error") or message
         raise InputError(message)
+
+
+def _scene_parts(scenes: Strings) -> Parts:
+    return [("scene", name) for name in scenes]
 
 
 def _image_part(image: np.ndarray | PathLike, name: str) -> Part:
@@ -187,6 +199,8 @@ def _estimate(row: Mapping[str, Any]) -> PoseEstimate:
         covariance=covariance and np.array(covariance),
         milliseconds=row["ms"],
         alternatives=tuple(map(_pose, row["alternatives"])),
+        alternatives_in=tuple(row["alternatives_in"]),
+        base=row["base"],
     )
 
 

@@ -5,6 +5,7 @@ import math
 import os
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from evercal.errors import InputError, UnavailableError
@@ -45,6 +46,11 @@ class LiveMap:
             return self.current.localizer
         except InputError as error:
             raise UnavailableError(self.fault or str(error)) from None
+
+    def within(self, scenes: Sequence[str]) -> Localizer:
+        """The localizer of some scenes, or of all where none is named."""
+        localizer = self.localizer
+        return localizer.within(scenes) if scenes else localizer
 
     def refresh(self) -> bool:
         """Open the map again if another process has changed it; True if that was tried.

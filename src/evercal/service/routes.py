@@ -10,6 +10,7 @@ from fastapi import (
     Depends,
     File,
     Form,
+    Query,
     Request,
     Response,
     UploadFile,
@@ -41,6 +42,7 @@ from evercal.service.limits import (
 )
 from evercal.service.live_map import LiveMap
 from evercal.service.stream import Frame, Stream
+from evercal.typing import Strings
 
 router = APIRouter()
 CameraFile = Annotated[
@@ -50,6 +52,9 @@ CameraFile = Annotated[
 PosesFile = Annotated[
     UploadFile | None,
     File(description="base_from_gripper of every image: a table as text, or JSON."),
+]
+Scenes = Annotated[
+    Strings, Form(description="Names of scenes; others are not considered.")
 ]
 Shots = Annotated[list[UploadFile], File(description="Image files, all of one camera.")]
 _NAME = 100
@@ -75,7 +80,7 @@ Asked = Annotated[Service, Depends(service_of)]
 
 
 def form(*known: str) -> Any:
-    """Refuse other fields of a form, and all but `images` more than once."""
+    """Refuse other fields of a form, and all but `images` and `scene` more than once."""
 
     async def check(request: Request) -> None:
         parts = await request.form()
@@ -86,7 +91,7 @@ def form(*known: str) -> Any:
                     f"{name[:_NAME]!r} is no field of this form; it has {fields}"
                 )
             count = len(parts.getlist(name))
-            if count > 1 and name != "images":
+            if count > 1 and name not in ("images", "scene"):
                 raise InputError(f"{name}: given {count} times; give it once")
 
     return Depends(check)
@@ -118,12 +123,13 @@ async def scenes(service: Asked) -> dict[str, Any]:
     return {"scenes": list(service.live.current.scenes)}
 
 
-@router.post("/localize", dependencies=[form("image", "camera")])
+@router.post("/localize", dependencies=[form("image", "camera", "scene")])
 async def localize(
     service: Asked,
     request: Request,
     image: UploadFile,
     camera: CameraFile = None,
+    scene: Scenes = (),
 ) -> dict[str, Any]:
     """Estimate the camera pose of one image: the row of `evercal localize --json`."""
     name = _name(image, "image")
@@ -131,7 +137,7 @@ async def localize(
     intrinsics = await _content(camera)
 
     def work(_: Check) -> dict[str, Any]:
-        localizer = service.live.localizer
+        localizer = service.live.within(scene)
         began = time.perf_counter()
         pixels = decoded(data, name, service.limits)
         estimate = localizer.localize(
@@ -174,7 +180,7 @@ async def _images(
 
 @router.post(
     "/calibrations",
-    dependencies=[form("camera", "robot_poses", "mount", "images")],
+    dependencies=[form("camera", "robot_poses", "mount", "scene", "images")],
 )
 async def calibrations(
     service: Asked,
@@ -183,20 +189,21 @@ async def calibrations(
     camera: CameraFile = None,
     robot_poses: PosesFile = None,
     mount: Annotated[MountName | None, Form()] = None,
+    scene: Scenes = (),
 ) -> dict[str, Any]:
     """Calibrate a camera from its images: the calibration file."""
     decode = await _images(service, images, camera, robot_poses)
 
     def work(check: Check) -> dict[str, Any]:
         given = decode(check)
-        return calibrate(service.live.localizer, given, mount).to_dict()
+        return calibrate(service.live.within(scene), given, mount).to_dict()
 
     return await service.desk.run(work, request)
 
 
 @router.post(
     "/check",
-    dependencies=[form("camera", "robot_poses", "calibration", "images")],
+    dependencies=[form("camera", "robot_poses", "calibration", "scene", "images")],
 )
 async def check(
     service: Asked,
@@ -207,6 +214,7 @@ async def check(
     ],
     camera: CameraFile = None,
     robot_poses: PosesFile = None,
+    scene: Scenes = (),
 ) -> dict[str, Any]:
     """Test whether a fixed camera has moved: the object of `evercal check --json`."""
     decode = await _images(service, images, camera, robot_poses)
@@ -216,7 +224,7 @@ async def check(
         reference = calibration_of(content)
         given = decode(check)
         shift = drift.check(
-            service.live.localizer,
+            service.live.within(scene),
             given.images,
             reference,
             given.camera,
@@ -247,13 +255,18 @@ async def metrics(service: Asked) -> Response:
 
 
 @router.websocket("/track")
-async def track(socket: WebSocket, service: Asked, newest: bool = False) -> None:
+async def track(
+    socket: WebSocket,
+    service: Asked,
+    newest: bool = False,
+    scene: Annotated[Strings, Query()] = (),
+) -> None:
     """Frames in, rows out: each binary message is an image file, each answer a JSON row.
 
     Rows have the state of the tracking (`tracking`, `relocalized`, `lost`). A text message holds
     the intrinsics of the frames that follow, as `camera` of `/localize`. A frame that cannot be
     used is answered with `{"error": ...}`. Frames wait in order; with `newest` only the newest
-    waits, and the others are dropped.
+    waits, and the others are dropped. With `scene`, frames are located in these scenes only.
     """
     tracker: Tracker | None = None
     tracked: tuple[Localizer, bytes] | None = None
@@ -265,7 +278,7 @@ async def track(socket: WebSocket, service: Asked, newest: bool = False) -> None
         # The map or the camera changed.
         if tracker is None or tracked != (localizer, frame.intrinsics):
             camera = camera_of(frame.intrinsics or None, image.shape[1::-1])
-            tracker = Tracker(localizer, camera)
+            tracker = Tracker(service.live.within(scene), camera)
             tracked = (localizer, frame.intrinsics)
         located = tracker.track(image, time.monotonic())
         known = unit_known(localizer, located.estimate.scene)
