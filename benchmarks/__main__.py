@@ -42,6 +42,7 @@ VERBS = {
         "shared_errors",
         "arms whose stated poses err together: errors, sigma, few poses",
     ),
+    "same-place": ("same_place", "one place in two scenes: bases, robots, twins"),
     "boards": ("boards", "detection of rendered boards, beside the finders of OpenCV"),
     "handeye-boards": ("hand_eye_boards", "boards and intrinsics from the same images"),
     "board-errors": (

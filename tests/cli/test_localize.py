@@ -18,7 +18,7 @@ from evercal.localization.estimate import PoseEstimate
 from evercal.recordings import read_image, write_image
 
 KEYS = "path status reason scene base_from_camera covariance inliers inlier_ratio support ms"
-KEYS += " error_terms unit alternatives parent_frame"
+KEYS += " error_terms unit alternatives alternatives_in parent_frame base"
 CAUSES = ["view", "lens", "map", "stated poses", "base frame"]
 
 

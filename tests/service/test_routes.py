@@ -144,7 +144,7 @@ def test_limits_of_images_and_of_the_queue(serve, hall_store, image):
 def test_other_fields_of_a_form_are_refused_by_name(hall_service, image):
     for name in ("camra", "Image", "x" * 500):
         got = hall_service.post("/localize", image=image, **{name: image})
-        known = "is no field of this form; it has image, camera"
+        known = "is no field of this form; it has image, camera, scene"
         assert got.refusal == (400, f"{name[:100]!r} {known}")
     got = hall_service.post("/localize", image=[image] * 2)
     assert got.refusal == (400, "image: given 2 times; give it once")

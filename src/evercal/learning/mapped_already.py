@@ -111,7 +111,7 @@ def _mapped_already(contents: MapContents, scene: SceneMap) -> list[_Relation]:
 
 def _places(scene: SceneMap) -> Mapping[str, SE3]:
     """place_from_base by place; maps that earlier versions wrote are in a place of their own."""
-    return scene.places or {scene.place: SE3.identity()}
+    return scene.places or {scene.digest: SE3.identity()}
 
 
 class _View(NamedTuple):

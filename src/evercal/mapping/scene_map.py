@@ -77,11 +77,6 @@ class SceneMap:
         return sum(map(len, self.keyframes.landmarks))
 
     @property
-    def place(self) -> str:
-        """Identifies the place of a scene that is the first one to map it."""
-        return hashlib.sha256(b"".join(self.keyframes.images)).hexdigest()[:16]
-
-    @property
     def digest(self) -> str:
         """Identifies the map and its base frame: poses with the same digest share their errors."""
         digest = hashlib.sha256(b"".join(self.keyframes.images))
