@@ -127,7 +127,7 @@ def other(
 @pytest.fixture(scope="session")
 def content() -> Contents:
     """Everything in a map, for comparisons."""
-    from evercal.mapping.store import correction_tensors, frame_to_dict
+    from evercal.mapping.map_frame import correction_tensors, frame_to_dict
 
     def values(contents: MapContents) -> list[object]:
         listed: list[object] = []

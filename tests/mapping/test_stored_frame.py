@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from evercal.geometry import SE3
-from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity
-from evercal.mapping.store import (
+from evercal.mapping.map_frame import (
+    FrameCorrection,
+    MapFrame,
+    Similarity,
     correction_of,
     correction_tensors,
     frame_of,

@@ -199,16 +199,19 @@ class LearnedScenes:
         recording = named_recording(recording, name, taken)
         with self._store.writing(), shown(on_progress) as step:
             scene, report = learned(recording, step)
-            scene = replace(scene, base=base or recording.base or "")
-            return self._commit(scene, report, replaced)
+            return self._commit(scene, report, base or recording.base, replaced)
 
     def _commit(
-        self, scene: SceneMap, report: LearnReport, replaced: str | None = None
+        self,
+        scene: SceneMap,
+        report: LearnReport,
+        base: str | None,
+        replaced: str | None = None,
     ) -> LearnReport:
         from evercal.learning.mapped_already import placed
 
         kept = self._store.contents.without(replaced)
-        scene, same_place = placed(scene, kept)
+        scene, same_place = placed(replace(scene, base=base or ""), kept)
         size = kept.with_scene(scene).memory_bytes
         report = replace(report, memory_bytes=size, same_place=same_place)
         self._store.commit(scene, report.stored(), replaced)
@@ -231,8 +234,7 @@ class LearnedScenes:
     ) -> tuple[LearnReport, ...]:
         """Learn recordings in parallel; the result is identical to learning them one by one.
 
-        Scenes are added in the order of the recordings. A recording that cannot be used does not
-        stop the others.
+        Scenes are added in order. A recording that cannot be used does not stop the others.
 
         Args:
             recordings: Recordings, their paths, or addresses such as `s3://bucket/folder`.
@@ -240,8 +242,7 @@ class LearnedScenes:
             workers: Processes; they share the threads of this machine.
             ray: Address of a Ray cluster, whose workers learn instead: `auto`, `HOST:PORT` or
                 `ray://HOST:PORT`. All its machines reach the paths.
-            results: Folder or address where every learned scene is kept, so that the same call
-                goes on where another one was stopped.
+            results: Folder or address that keeps learned scenes for a call that goes on.
             base: Name of the robot's base in all of them, as for `learn`.
             memory: Keyframes of each scene, as for `learn`.
             options: Sizes and priors of the map.
@@ -273,8 +274,7 @@ class LearnedScenes:
                 if learned.scene is None or learned.report is None:
                     failed.append(f"{sources[learned.number].name} ({learned.error})")
                     continue
-                scene = replace(learned.scene, base=base or "")
-                reports.append(self._commit(scene, learned.report))
+                reports.append(self._commit(learned.scene, learned.report, base))
                 on_scene(reports[-1])
         many.refuse_failures(failed, len(failed) + len(reports))
         return tuple(reports)

@@ -142,8 +142,8 @@ def merge_maps(
 ) -> Merged:
     """Add the scenes of other maps to a map, all in one step.
 
-    A new map takes the encoder of the first one. Scenes are copied unchanged, and no scene depends
-    on the others, so a map that learned all scenes in turn gives the same answers.
+    A new map takes the encoder of the first one. A map that learned all scenes in turn gives the
+    same answers.
 
     Args:
         store: The map that grows.
@@ -181,14 +181,7 @@ def merge_maps(
         for item in scenes:
             merge.add(item)
     if merge.incoming:
-        _commit(
-            store,
-            merge,
-            contents,
-            networks,
-            roots[0],
-            place,
-        )
+        _commit(store, merge, contents, networks, roots[0], place)
     return Merged(
         tuple(merge.incoming),
         tuple(merge.renamed),

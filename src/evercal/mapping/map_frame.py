@@ -11,12 +11,15 @@ the map's frame and not of single frames, so localization undoes them:
 Slow corrections are predicted from neighbouring frames. Noise cannot be predicted and remains.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evercal.classes import frozen_arrays
-from evercal.geometry import SE3, UncertainPose, norms
+from evercal.geometry import SE3, UncertainPose, norms, pose_to_dict
 from evercal.typing import Array
 
 RADII = ((0.1, 10.0), (0.2, 15.0), (0.4, 25.0))
@@ -252,3 +255,72 @@ def _closeness(
     far = metres / radius[0]
     turned = angle / radius[1]
     return np.exp(-0.5 * far**2 - 0.5 * turned**2)
+
+
+def frame_to_dict(frame: MapFrame) -> dict[str, object]:
+    """A map's frame as JSON values, without its slowly varying corrections."""
+    base = None
+    similarity = frame.similarity
+    if similarity is not None:
+        base = similarity.base_from_map
+    covariance = frame.base_covariance
+    return {
+        "stated_camera_from_camera": pose_to_dict(frame.common),
+        "pose_sigma": list(frame.pose_sigma),
+        "frame_sigma": list(frame.frame_sigma),
+        "base_from_map": pose_to_dict(base),
+        "scale": frame.scale,
+        "unit_known": similarity is None or similarity.metric,
+        "base_covariance": None if covariance is None else covariance.tolist(),
+    }
+
+
+def frame_of(
+    content: Mapping[str, Any], correction: FrameCorrection | None
+) -> MapFrame:
+    """The inverse of `frame_to_dict`."""
+    base = content["base_from_map"]
+    covariance = content["base_covariance"]
+    if covariance is not None:
+        covariance = np.asarray(covariance, float)
+    similarity = None
+    if base is not None:
+        metric = bool(content.get("unit_known", True))
+        similarity = Similarity(stored_pose(base), float(content["scale"]), metric)
+    return MapFrame(
+        common=stored_pose(content["stated_camera_from_camera"]),
+        correction=correction,
+        pose_sigma=_pair(content["pose_sigma"]),
+        frame_sigma=_pair(content["frame_sigma"]),
+        similarity=similarity,
+        base_covariance=covariance,
+    )
+
+
+def _pair(values: Sequence[float]) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+def stored_pose(values: Any) -> SE3:
+    """A stored pose to its last bit; maps of earlier versions hold a matrix, which rounds it."""
+    if isinstance(values, list):
+        return SE3.from_matrix(np.asarray(values))
+    return SE3(values["quaternion_wxyz"], values["translation_m"])
+
+
+def correction_tensors(correction: FrameCorrection) -> dict[str, NDArray[Any]]:
+    """Slowly varying corrections as named arrays."""
+    rows = [correction.poses.rotation_wxyz, correction.poses.translation_m]
+    return {
+        "poses": np.concatenate(rows, -1),
+        "correction": np.asarray(correction.correction),
+        "radius": np.asarray(correction.radius, float),
+    }
+
+
+def correction_of(tensors: Mapping[str, NDArray[Any]]) -> FrameCorrection:
+    """The inverse of `correction_tensors`."""
+    rows = tensors["poses"]
+    poses = SE3(rows[:, :4], rows[:, 4:])
+    radius = _pair(tensors["radius"].tolist())
+    return FrameCorrection(poses, tensors["correction"], radius)

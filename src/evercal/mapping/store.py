@@ -9,17 +9,16 @@ stages/0001-NAME/
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evercal.bounds import bounds
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder, Features, load_encoder
-from evercal.geometry import SE3, Camera, pose_to_dict
+from evercal.geometry import Camera, pose_to_dict
 from evercal.mapping.consistency import (
     of_evercal,
     require_consistent,
@@ -27,7 +26,13 @@ from evercal.mapping.consistency import (
     require_of_encoder,
 )
 from evercal.mapping.keyframes import Keyframes
-from evercal.mapping.map_frame import FrameCorrection, MapFrame, Similarity
+from evercal.mapping.map_frame import (
+    correction_of,
+    correction_tensors,
+    frame_of,
+    frame_to_dict,
+    stored_pose,
+)
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.recordings.frame import checked_name
 from evercal.robot.frame_names import FrameNames
@@ -333,75 +338,7 @@ def _read_scene(folder: Path) -> SceneMap:
         unit=unit,
         base=str(content.get("base", "")),
         places={
-            place: _pose_of(pose) for place, pose in content.get("places", {}).items()
+            place: stored_pose(pose)
+            for place, pose in content.get("places", {}).items()
         },
     )
-
-
-def frame_to_dict(frame: MapFrame) -> dict[str, object]:
-    """A map's frame as JSON values, without its slowly varying corrections."""
-    base = None
-    similarity = frame.similarity
-    if similarity is not None:
-        base = similarity.base_from_map
-    covariance = frame.base_covariance
-    return {
-        "stated_camera_from_camera": pose_to_dict(frame.common),
-        "pose_sigma": list(frame.pose_sigma),
-        "frame_sigma": list(frame.frame_sigma),
-        "base_from_map": pose_to_dict(base),
-        "scale": frame.scale,
-        "unit_known": similarity is None or similarity.metric,
-        "base_covariance": None if covariance is None else covariance.tolist(),
-    }
-
-
-def frame_of(
-    content: Mapping[str, Any], correction: FrameCorrection | None
-) -> MapFrame:
-    """The inverse of `frame_to_dict`."""
-    base = content["base_from_map"]
-    covariance = content["base_covariance"]
-    if covariance is not None:
-        covariance = np.asarray(covariance, float)
-    similarity = None
-    if base is not None:
-        metric = bool(content.get("unit_known", True))
-        similarity = Similarity(_pose_of(base), float(content["scale"]), metric)
-    return MapFrame(
-        common=_pose_of(content["stated_camera_from_camera"]),
-        correction=correction,
-        pose_sigma=_pair(content["pose_sigma"]),
-        frame_sigma=_pair(content["frame_sigma"]),
-        similarity=similarity,
-        base_covariance=covariance,
-    )
-
-
-def _pair(values: Sequence[float]) -> tuple[float, float]:
-    return float(values[0]), float(values[1])
-
-
-def _pose_of(values: Any) -> SE3:
-    """A pose to its last bit; maps written by earlier versions hold a matrix, which rounds it."""
-    if isinstance(values, list):
-        return SE3.from_matrix(np.asarray(values))
-    return SE3(values["quaternion_wxyz"], values["translation_m"])
-
-
-def correction_tensors(correction: FrameCorrection) -> dict[str, NDArray[Any]]:
-    """Slowly varying corrections as named arrays."""
-    rows = [correction.poses.rotation_wxyz, correction.poses.translation_m]
-    return {
-        "poses": np.concatenate(rows, -1),
-        "correction": np.asarray(correction.correction),
-        "radius": np.asarray(correction.radius, float),
-    }
-
-
-def correction_of(tensors: Mapping[str, NDArray[Any]]) -> FrameCorrection:
-    """The inverse of `correction_tensors`."""
-    rows = tensors["poses"]
-    poses = SE3(rows[:, :4], rows[:, 4:])
-    radius = _pair(tensors["radius"].tolist())
-    return FrameCorrection(poses, tensors["correction"], radius)

@@ -152,15 +152,15 @@ async def localize(
     return row
 
 
-async def _images(
-    service: Service,
-    files: list[UploadFile],
-    camera: UploadFile | None,
-    robot_poses: UploadFile | None,
+async def _decode(
+    service: Asked,
+    images: Shots,
+    camera: CameraFile = None,
+    robot_poses: PosesFile = None,
 ) -> Callable[[Check], Images]:
     """A function that decodes the images of a request, with their camera and robot poses."""
     contents = []
-    for i, file in enumerate(files):
+    for i, file in enumerate(images):
         contents.append((_name(file, f"image {i}"), await file.read()))
     sent = Sent(contents, service.limits)
     intrinsics = await _content(camera)
@@ -178,6 +178,9 @@ async def _images(
     return decode
 
 
+Decode = Annotated[Callable[[Check], Images], Depends(_decode)]
+
+
 @router.post(
     "/calibrations",
     dependencies=[form("camera", "robot_poses", "mount", "scene", "images")],
@@ -185,14 +188,11 @@ async def _images(
 async def calibrations(
     service: Asked,
     request: Request,
-    images: Shots,
-    camera: CameraFile = None,
-    robot_poses: PosesFile = None,
+    decode: Decode,
     mount: Annotated[MountName | None, Form()] = None,
     scene: Scenes = (),
 ) -> dict[str, Any]:
     """Calibrate a camera from its images: the calibration file."""
-    decode = await _images(service, images, camera, robot_poses)
 
     def work(check: Check) -> dict[str, Any]:
         given = decode(check)
@@ -208,16 +208,13 @@ async def calibrations(
 async def check(
     service: Asked,
     request: Request,
-    images: Shots,
+    decode: Decode,
     calibration: Annotated[
         UploadFile, File(description="The calibration file of the camera.")
     ],
-    camera: CameraFile = None,
-    robot_poses: PosesFile = None,
     scene: Scenes = (),
 ) -> dict[str, Any]:
     """Test whether a fixed camera has moved: the object of `evercal check --json`."""
-    decode = await _images(service, images, camera, robot_poses)
     content = await calibration.read()
 
     def work(check: Check) -> dict[str, Any]:
