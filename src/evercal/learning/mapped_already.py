@@ -54,9 +54,8 @@ class _Relation:
     def record(self) -> SamePlace:
         """What the report of the new scene says of it."""
         degrees = float(np.rad2deg(self.radians))
-        return SamePlace(
-            self.scene.name, self.scene.base, 1000 * self.metres, degrees, self.same
-        )
+        mm = 1000 * float(self.metres)
+        return SamePlace(self.scene.name, self.scene.base, mm, degrees, self.same)
 
 
 def placed(
@@ -77,7 +76,8 @@ def placed(
         if far and not other.same and scene.base and scene.base == record.base:
             raise InputError(
                 f"scene {scene.name!r}: {record.distance} from the poses of {record.scene} in base"
-                f" {scene.base!r}: the base was moved (`replace`), or it is another one (`base`)"
+                f" {scene.base!r}: the base or most things were moved (`replace`), or it is another"
+                " base (`base`)"
             )
         others.append(record)
         for place, place_from_other in _places(other.scene).items():

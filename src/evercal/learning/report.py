@@ -39,8 +39,8 @@ class SamePlace:
         """What it means for the answers."""
         return (
             f"this place is mapped as {self.scene}, in a base {self.distance} from that of the"
-            f" stated poses. Its images are ambiguous until `scene` names a scene. If the base was"
-            f" moved, replace the old scene: 'evercal map remove MAP {self.scene}'"
+            f" stated poses. Its images are ambiguous until `scene` names a scene. If the base or"
+            f" most things were moved, remove the old scene: 'evercal map remove MAP {self.scene}'"
         )
 
 
