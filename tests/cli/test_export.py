@@ -87,7 +87,7 @@ def test_unknown_frames_are_asked_for_and_named_by_the_next_step(run, make):
     file = make()
     known = read_calibration(file)
     words = ("export", file, "--format", "easy_handeye2")
-    assert export_words(known, file) == words
+    assert (*export_words(known, file),) == words
     unknown = replace(known, frames=FrameNames("base_link"))
     unknown.write(file)
     refused = run(*words)
@@ -98,7 +98,7 @@ def test_unknown_frames_are_asked_for_and_named_by_the_next_step(run, make):
         " --robot-frame, such as tool0 or flange"
     ]
     options = ("--child", "CAMERA", "--robot-frame", "GRIPPER")
-    assert export_words(unknown, file) == words + options
+    assert (*export_words(unknown, file),) == words + options
     assert run(*words, *options).code == 0
 
 

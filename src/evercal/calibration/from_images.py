@@ -194,18 +194,12 @@ def _held_thing_calibration(
 
 def _names(given: Images, scene: "SceneMap", held: bool) -> FrameNames:
     """The camera is that of the images, and not the one that recorded the scene."""
-    names = given.frames
     role = "gripper" if held else "base"
-    stated = vars(names)[role]
-    learned = vars(scene.frames)[role]
-    if learned and stated not in ("", learned):
-        raise InputError(
-            f"`{role}_frame` {stated}: scene {scene.name} is in {learned}; give it, with poses of"
-            " that frame"
-        )
+    own = FrameNames(**{role: vars(scene.frames)[role]})
+    names = own.told(given.frames, f"scene {scene.name}")
     if given.base_from_gripper is None:
-        return replace(names.or_of(scene.frames), camera=names.camera)
-    return replace(names, **{role: learned or stated})
+        names = replace(names.or_of(scene.frames), camera=names.camera)
+    return names
 
 
 def _checks(view: _View) -> ImageChecks:

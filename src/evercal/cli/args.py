@@ -15,6 +15,7 @@ from evercal.classes import frozen
 from evercal.cli.console import print_json, print_next, say
 from evercal.errors import InputError
 from evercal.processes import cores
+from evercal.robot.frame_names import FrameNames
 from evercal.typing import Strings
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
     from evercal.recordings import Recording
     from evercal.reports.inspected import LearnedLocalizer
-    from evercal.robot.frame_names import FrameNames
     from evercal.robot.pose_errors import ArmErrors
 
 MAP = "evercal"
@@ -132,10 +132,8 @@ class Named:
     camera_frame: Name = None
     """Name of the camera's optical frame. Default: that of the images of a bag."""
 
-    def names(self) -> "FrameNames":
+    def names(self) -> FrameNames:
         """The names."""
-        from evercal.robot.frame_names import FrameNames
-
         return FrameNames(*(name or "" for name in vars(self).values()))
 
 
@@ -212,14 +210,14 @@ class ArmGiven:
 WhichArm = Annotated[ArmGiven, arg(name="")]
 
 
-def export_words(calibration: "Calibration", file: object) -> tuple[object, ...]:
+def export_words(calibration: "Calibration", file: object) -> list[object]:
     """The words of an export of a calibration file to ROS, with options for unknown names."""
     from evercal.calibration.export.request import unknown_frames
 
-    words = ["export", file, "--format", "easy_handeye2"]
+    words: list[object] = ["export", file, "--format", "easy_handeye2"]
     for name, role in unknown_frames(calibration).items():
         words += [option(name), role.upper()]
-    return tuple(words)
+    return words
 
 
 def option(field: str) -> str:

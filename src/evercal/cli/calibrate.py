@@ -99,8 +99,9 @@ class Calibrate(args.Verb):
         from evercal.calibration.image_source import Images
 
         camera = args.camera_for(self.camera, files)
-        names = self.frames.names()
-        images = Images.of(files, camera, self.robot_poses, self.convention, names)
+        images = Images.of(
+            files, camera, self.robot_poses, self.convention, self.frames.names()
+        )
         say_notes(images.notes)
         return images
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import field, fields
 from functools import partial
 from pathlib import Path
@@ -216,10 +216,10 @@ class Learn(args.Verb):
 
     def _next(
         self, recording: "Recording", report: "LearnReport", path: Path
-    ) -> tuple[object, ...]:
+    ) -> Sequence[object]:
         if report.hand_eye is not None:
-            calibration = report.hand_eye.calibration
-            return args.export_words(calibration, self.calibration or self.store)
+            file = self.calibration or self.store
+            return args.export_words(report.hand_eye.calibration, file)
         if not recording.metric:
             images = ("IMAGE...", "--robot-poses", "FILE")
             return "align", self.store, report.scene, *images

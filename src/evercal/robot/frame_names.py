@@ -35,13 +35,21 @@ class FrameNames:
             self.camera or other.camera,
         )
 
+    def told(self, names: "FrameNames", source: object) -> "FrameNames":
+        """These names of a source, and those given for its unknown frames; others are refused."""
+        for role, name in vars(names).items():
+            own = vars(self)[role] or name
+            if name not in ("", own):
+                raise InputError(
+                    f"`{role}_frame` {name}: {source} states {own}; leave the option out"
+                )
+        return self.or_of(names)
+
     @classmethod
     def from_dict(cls, names: Any) -> Self:
         """The inverse of `asdict`; other values raise ValueError."""
-        if not all(isinstance(name, str) for name in names.values()):
-            raise ValueError(f"names of frames are texts, got {names}")
         try:
-            return cls(**names)
+            return cls(**{role: str(name or "") for role, name in names.items()})
         except InputError as error:
             raise ValueError(str(error)) from None
 

@@ -172,7 +172,9 @@ def test_the_camera_of_a_scene_does_not_name_another_one(
     on_arm = cell.calibrate(images, robot_poses=poses, mount="eye_in_hand")
     assert on_arm.frames == FrameNames("base_link")
     turned = FrameNames("base", "tool0")
-    with pytest.raises(InputError, match="`base_frame` base: scene wrist is in base_l"):
+    with pytest.raises(
+        InputError, match="`base_frame` base: scene wrist states base_l"
+    ):
         cell.calibrate(images, robot_poses=poses, frames=turned)
 
 

@@ -34,10 +34,11 @@ _FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(/[A-Za-z0-9_.\-]+)*")
 
 
 _UNKNOWN = {
-    "base": "the base frame is unknown: give `{}` (of Universal Robots, base for poses of the"
-    " controller and base_link for those of tf, which are turned by 180 deg)",
-    "gripper": "the gripper frame is unknown: give `{}`, such as tool0 or flange",
-    "camera": "the camera's frame is unknown: give `{}`, such as camera_color_optical_frame",
+    "base": "the name of the base frame is unknown: give `{}` (of Universal Robots, base for poses"
+    " of the controller and base_link for those of tf, which are turned by 180 deg)",
+    "gripper": "the name of the gripper frame is unknown: give `{}`, such as tool0 or flange",
+    "camera": "the name of the camera's frame is unknown: give `{}`, such as"
+    " camera_color_optical_frame",
 }
 """What to do without the name of a frame."""
 
@@ -146,9 +147,9 @@ def prepare_export(
 ) -> Export:
     """Turn the pose for the intrinsics, rename and move its frames, and read the files."""
     calibration = _for_lens(calibration, options.get("lens"))
-    role_of = _frames_of_options(calibration)
-    stated = {role: options.get(option) or "" for option, role in role_of.items()}
-    names = FrameNames(**stated).or_of(calibration.frames)
+    role_of = _frames_of_options(calibration).items()
+    names = FrameNames(**{role: options.get(option) or "" for option, role in role_of})
+    names = names.or_of(calibration.frames)
     link = options.get("via")
     link_from_optical = _link_from_optical(names.camera or "camera", options)
     if link is not None:
@@ -157,12 +158,11 @@ def prepare_export(
             calibration, parent_from_child=moved.pose, covariance=moved.covariance
         )
         names = replace(names, camera=link)
-    for option, role in role_of.items():
-        frame = vars(names)[role]
+    for role, frame in vars(names).items():
         if frame and not _FRAME.fullmatch(frame):
             raise InputError(
                 f"{role} frame {frame!r} is no name of a tf frame; use letters, digits, _ . - and"
-                f" inner /, such as 'camera_color_optical_frame' (rename with `{option}`)"
+                f" inner /, such as 'camera_color_optical_frame' (rename with `parent` or `child`)"
             )
     calibration = replace(calibration, frames=names)
     robot = options.get("robot_poses")
@@ -194,8 +194,9 @@ def require_names(calibration: FramedPose, both: bool) -> None:
     if not both:
         unknown.pop("robot_frame", None)
     if unknown:
-        hints = [_UNKNOWN[role].format(option) for option, role in unknown.items()]
-        raise InputError(f"the name of {'; the name of '.join(hints)}")
+        raise InputError(
+            "; ".join(_UNKNOWN[role].format(name) for name, role in unknown.items())
+        )
 
 
 def _for_lens(calibration: FramedPose, lens: Camera | PathLike | None) -> FramedPose:

@@ -165,7 +165,7 @@ def _frames(root: Path, layout: RecordingLayout, options: ReadOptions) -> Record
     notes = (*notes, *more)
     named = rows.frames
     if not is_gripper:
-        named = FrameNames(named.base, camera=named.gripper)
+        named = FrameNames(named.base, "", named.gripper)
     return Recording(
         name, tuple(frames), (), lost, notes=notes, arm=rows.arm, frames=named
     )

@@ -211,6 +211,7 @@ class Controls:
             self._gui.add_text(f"{role} frame", "")
             for role in ("Base", "Gripper", "Camera")
         ]
+        camera.on_update(lambda _: setattr(fields[2], "value", ""))
 
         def export() -> str:
             names = FrameNames(*(field.value.strip() for field in fields))
