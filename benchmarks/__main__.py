@@ -69,6 +69,7 @@ VERBS = {
     "mutants": ("mutants", "small changes of the code that the tests should notice"),
     "networks": ("networks", "the experiments on networks; the paper's table on a GPU"),
     "wheels": ("wheels", "what lacks wheels on the platforms of docs/install.md"),
+    "verify": ("verify", "calibrations that err as stated, or more"),
     "tables": ("tables", "print the tables of the docs from results/"),
 }
 """Module and summary of every verb."""

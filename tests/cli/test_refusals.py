@@ -151,6 +151,15 @@ REFUSED = {
     "track MAP none": "no such folder or video",
     "track MAP images --out t.bin": "ends with .jsonl",
     "track MAP images --rate 0": "above 0",
+    "verify none.json": "calibration file is missing",
+    "verify c.json": "give --picks, --board-poses, or images with the --store",
+    "verify c.json image.png": "give --picks, --board-poses, or images with the --store",
+    "verify c.json --picks none.csv": "none.csv: table of points is missing",
+    "verify c.json --picks picks.csv": "give --points or --touches of these points",
+    "verify c.json --picks picks.csv --points picks.csv": "expected name, x, y, z, got 'image.png",
+    "verify c.json --picks unnamed.csv": "unnamed.csv: expected image, name, u, v, got 'image.pn",
+    "verify c.json --board-poses none.json": "file of camera poses is missing",
+    "verify c.json image.png --store MAP": "1 image with the target; give two or more",
     "view MAP --port 99999": "--port 99999: give 0 to 65535",
     "view MAP none.json": "none.json: calibration file is missing",
     "view MAP --camera c.json": "--camera: is that of --live, which is missing",
@@ -183,6 +192,8 @@ def folder(tmp_path, hall, monkeypatch) -> Path:
     Path("file").write_text("x")
     Path("short.txt").write_text("300 0 160")
     Path("poses.csv").write_text("x,y,z,qw,qx,qy,qz\n0,0,0,1,0,0,0\n")
+    Path("picks.csv").write_text("image.png,a,1,2\n")
+    Path("unnamed.csv").write_text("image,name,u,v\nimage.png,,1,2\n")
     Path("tall.json").write_text(
         json.dumps(Camera(240, 320, 250, 250, 119.5, 159.5).to_dict())
     )

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evercal.calibration.picked_points import read_picks, read_points
 from evercal.calibration.transform_file import read_transform
-from evercal.cli.align import read_rows
 from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings import (
     ReadOptions,
@@ -168,11 +168,10 @@ def test_lerobot_description(page: Path) -> None:
 
 
 def test_touched_points(page: Path) -> None:
-    points = read_rows(page / "touched.csv", 1, "name, x, y, z")
-    assert [names for names, _ in points] == [("corner",), ("screw",), ("edge",)]
-    picks = read_rows(page / "picks.csv", 2, "image, name, u, v")
-    assert picks[0][0] == ("images/a.jpg", "corner")
-    np.testing.assert_allclose(picks[0][1], [311.5, 204.0])
+    assert [*read_points(page / "touched.csv")] == ["corner", "screw", "edge"]
+    first = read_picks(page / "picks.csv")[0]
+    assert first[:2] == ("images/a.jpg", "corner")
+    np.testing.assert_allclose(first.pixel, [311.5, 204.0])
 
 
 def test_matrix(page: Path) -> None:

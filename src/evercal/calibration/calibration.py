@@ -9,7 +9,7 @@
      "lens": "estimated", "lenses": {"stated": {...}, "estimated": {...}},
      "for_stated_lens": {"matrix": [4][4], ..., "left_deg": x}, "images": [...],
      "error_terms": [...], "checks": {...}, "joints": [...], "joint_covariance": [k][k],
-     "verdict": "...", "source": {...}, "created": "..."}
+     "verdict": "...", "source": {...}, "created": "...", "verifications": [...]}
 
 Metres, radians, quaternions w, x, y, z, OpenCV camera axes. The pose belongs to `camera`, which is
 the one of `lenses` that `lens` names. `matrix`, `meaning`, `lens`, `for_stated_lens` and the sigmas
@@ -40,6 +40,9 @@ from evercal.typing import Array, JsonObject, PathLike
 
 if TYPE_CHECKING:
     from evercal.calibration.comparison import Comparison
+    from evercal.calibration.evidence import Data
+    from evercal.calibration.verification import Verification
+    from evercal.robot.pose_errors import ArmErrors
 
 FORMAT = "evercal-calibration"
 VERSION = 1
@@ -97,6 +100,8 @@ class Calibration(FramedPose):
     """Command, store, scene and options, JSON values."""
     created: str = ""
     """ISO 8601 time with zone."""
+    verifications: tuple[Mapping[str, Any], ...] = ()
+    """Tests by data that it had not seen, see `Verification.to_dict`."""
 
     def __post_init__(self) -> None:
         mount_named(self.mount)
@@ -176,6 +181,7 @@ class Calibration(FramedPose):
             "verdict": self.verdict,
             "source": dict(self.source),
             "created": self.created,
+            "verifications": list(self.verifications),
         }
 
     @classmethod
@@ -217,6 +223,7 @@ class Calibration(FramedPose):
             verdict=str(data.get("verdict", "")),
             source=data.get("source", {}),
             created=str(data.get("created", "")),
+            verifications=tuple(map(dict, data.get("verifications", []))),
         )
 
     def write(self, path: PathLike) -> None:
@@ -240,6 +247,20 @@ class Calibration(FramedPose):
                     measured.append((scatter, checks.images_used or 1))
         distance_m = distance_m or self.checks.target_m or other.checks.target_m
         return compare(self, other, distance_m, measured)
+
+    def verify(self, data: "Data", errors: "ArmErrors | None" = None) -> "Verification":
+        """Test the calibration with data that it has not seen, and judge whether it is honest.
+
+        Args:
+            data: From `unseen.touched.touched_data` or `unseen.targets.target_data`.
+            errors: What is known of the arm. Default: its joints have no offsets.
+
+        Raises:
+            InputError: The data are far from what the calibration predicts.
+        """
+        from evercal.calibration.verification import judge
+
+        return judge(self, data, errors)
 
     def export(
         self, format: ExportFormat | str, path: PathLike | None = None, **options: Any

@@ -36,6 +36,7 @@ VERBS = {
         "studio",
         "eye-to-hand",
         "calibrate",
+        "verify",
         "check",
         "watch",
         "audit",

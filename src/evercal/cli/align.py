@@ -95,14 +95,14 @@ class Align(args.Verb):
         )
 
     def _by_points(self, cell: "Map") -> "MapAlignment":
+        from evercal.calibration.picked_points import read_picks, read_points
         from evercal.recordings import read_image
 
         if self.points is None or self.picks is None:
             raise InputError("--points and --picks belong together; give both")
-        rows = read_rows(self.points, 1, "name, x, y, z")
-        points = {name: point for (name,), point in rows}
+        points = read_points(self.points)
         by_image: dict[str, dict[str, np.ndarray]] = {}
-        for (image, name), pixel in read_rows(self.picks, 2, "image, name, u, v"):
+        for image, name, pixel, _ in read_picks(self.picks):
             if name not in points:
                 raise InputError(
                     f"{self.picks}: point {name!r} is not in {self.points}"
@@ -142,40 +142,3 @@ class Align(args.Verb):
             *(f"warning: {warning}" for warning in alignment.warnings),
             then=("calibrate", self.store, "IMAGE..."),
         )
-
-
-def read_rows(
-    path: Path, names: int, columns: str
-) -> "list[tuple[tuple[str, ...], np.ndarray]]":
-    """Words and numbers of every line of a table of these columns; a header line is skipped."""
-    import csv
-
-    import numpy as np
-
-    from evercal.storage.text_files import read_text
-
-    count = columns.count(",") + 1
-    lines = read_text(path, "table of points").splitlines()
-    try:
-        cells = list(csv.reader(lines, skipinitialspace=True))
-    except csv.Error as error:
-        raise InputError(f"{path}: no table ({error}); expected {columns}") from None
-    rows = []
-    for number, row in enumerate(cells, start=1):
-        if not row or row[0].startswith("#"):
-            continue
-        try:
-            if len(row) != count:
-                raise ValueError
-            values = np.array([float(cell) for cell in row[names:]])
-        except ValueError:
-            if number == 1:
-                continue
-            got = ",".join(row)
-            raise InputError(
-                f"{path}:{number}: expected {columns}, got {got!r}"
-            ) from None
-        rows.append((tuple(row[:names]), values))
-    if not rows:
-        raise InputError(f"{path}: no rows in it; expected {columns}")
-    return rows

@@ -299,8 +299,8 @@ class Point(NamedTuple):
     z: float
 
     @classmethod
-    def parse(cls, text: str | None) -> "Point | None":
-        """The point of --at; None if the option was omitted."""
+    def parse(cls, text: str | None, option: str = "--at") -> "Point | None":
+        """The point of an option; None if it was omitted."""
         if text is None:
             return None
         try:
@@ -308,7 +308,9 @@ class Point(NamedTuple):
         except (ValueError, TypeError):
             point = cls(math.nan, math.nan, math.nan)
         if not all(map(math.isfinite, point)):
-            raise InputError(f"--at {text}: give x,y,z in metres such as 0,0.05,0.4")
+            raise InputError(
+                f"{option} {text}: give x,y,z in metres such as 0,0.05,0.4"
+            )
         return point
 
     def record(self, parent_from_camera: "UncertainPose") -> dict[str, object]:

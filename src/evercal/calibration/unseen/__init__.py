@@ -1,0 +1,1 @@
+"""Data that a calibration has not seen, for `verify`."""
