@@ -20,10 +20,10 @@ from evercal.robot.pose_errors import ArmErrors
 from evercal.typing import Array, JsonObject
 
 Verdict = Literal["honest", "not as stated", "cannot tell"]
-_QUANTILES = (0.02, 0.5, 0.95)
+_QUANTILES = (0.01, 0.5, 0.95)
 """Of the factor between true and stated errors. As its prior is that of a scale, the first one is
 above 1 for at most that share of calibrations that err as they state."""
-_UNLIKELY = 0.005
+_UNLIKELY = 0.002
 """Probability of d2 below which a calibration does not err as it states, whatever the factor."""
 EXCLUDED = 4.0
 """Data that do not exclude errors of so many times the stated ones tell nothing."""
@@ -71,7 +71,7 @@ class Verification:
     d2: float
     """Squared Mahalanobis distance of the residuals, 6 or less for one that errs as it states."""
     factor: tuple[float, float, float]
-    """True errors over stated ones: the 2 %, 50 % and 95 % quantile."""
+    """True errors over stated ones: the 1 %, 50 % and 95 % quantile."""
     causes: Mapping[str, float]
     """Probabilities of errors that would explain the residuals, if they are not as stated."""
     misses_m: Mapping[str, float]
