@@ -114,9 +114,8 @@ def _trial(seed: int, moves: bool, bad: bool) -> Trial:
         away /= np.linalg.norm(away, axis=1, keepdims=True)
         error = error + np.r_[shift * away[0], turn * away[1]]
     mount = "eye_in_hand" if moves else "eye_to_hand"
-    parent = "gripper" if moves else "base"
     stated = plus(true, -error)
-    calibration = Calibration(mount, stated, covariance, parent, camera=cell.intrinsics)
+    calibration = Calibration(mount, stated, covariance, camera=cell.intrinsics)
     return Trial(calibration, true, cell, rng)
 
 

@@ -116,9 +116,7 @@ def test_a_camera_on_the_gripper_needs_a_pose_for_each_image(run, folder: Path) 
     gripper = SE3.from_translation([0.4, 0.0, 0.4])
     own = read_calibration("tripod.json")
     mounted = gripper.inverse() @ TRIPOD
-    wrist = Calibration(
-        "eye_in_hand", mounted, own.covariance, "gripper", camera=CAMERA
-    )
+    wrist = Calibration("eye_in_hand", mounted, own.covariance, camera=CAMERA)
     wrist.write("wrist.json")
     assert "give the gripper's pose" in run.refused("verify wrist.json", TOUCHED)
     Path("poses.csv").write_text("image,x,y,z,qw,qx,qy,qz\nb.png,0.4,0,0.4,1,0,0,0\n")

@@ -30,8 +30,7 @@ TOOL = np.array([0.01, -0.02, 0.12])
 
 def calibration(pose: SE3, moves: bool = False) -> Calibration:
     mount = "eye_in_hand" if moves else "eye_to_hand"
-    parent = "gripper" if moves else "base"
-    return Calibration(mount, pose, np.diag(SIGMA**2), parent, camera=CAMERA)
+    return Calibration(mount, pose, np.diag(SIGMA**2), camera=CAMERA)
 
 
 def down(points: np.ndarray, seed: int = 0) -> SE3:
