@@ -19,12 +19,19 @@ def estimate(scene: str | None, reason: str = "") -> PoseEstimate:
     return PoseEstimate(status, reason, scene, pose, np.eye(6) * 1e-6, 100, 0.5, 1.0)
 
 
-def located(poses: SE3, scenes: Sequence[str | None] | None = None) -> list[ImagePose]:
+def located(
+    poses: SE3,
+    scenes: Sequence[str | None] | None = None,
+    bases: Sequence[str] | None = None,
+) -> list[ImagePose]:
     names = scenes or ["room"] * len(poses)
-    return [
-        ImagePose(f"{i}.png", estimate(names[i], "too dark"), pose, np.eye(6) * 1e-6)
-        for i, pose in enumerate(poses)
-    ]
+    covariance = np.eye(6) * 1e-6
+    items = []
+    for i, pose in enumerate(poses):
+        found = estimate(names[i], "too dark")
+        base = str(names[i]) if bases is None else bases[i]
+        items.append(ImagePose(f"{i}.png", found, pose, covariance, base))
+    return items
 
 
 def scattered(count: int, seed: int = 0, sigma: float = 5e-4) -> tuple[SE3, SE3]:
@@ -58,7 +65,16 @@ def test_images_of_other_scenes_are_named() -> None:
     assert fused.scene == "room"
     assert fused.used.tolist() == [True, False, False, True, True]
     assert fused.uses[1].reason == "shows scene hall; most images show room"
+
     assert fused.uses[2].reason == "unknown scene: too dark"
+
+
+def test_scenes_of_one_base_are_fused() -> None:
+    _, poses = scattered(5)
+    scenes = ["room", "hall", "far", "hall", "room"]
+    fused = fuse(located(poses, scenes, ["room", "room", "far", "room", "room"]))
+    assert fused.used.tolist() == [True, True, False, True, True]
+    assert fused.uses[2].reason.startswith("shows scene far")
     with pytest.raises(InputError, match="0 of 2 images were located"):
         fuse(located(poses[:2], [None, None]))
 

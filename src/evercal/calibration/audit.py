@@ -1,12 +1,13 @@
 """Detect recorded episodes whose images disagree with the stated camera pose."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from evercal.calibration.located import ImagePose, fuse, locate
+from evercal.calibration.located import fuse, locate
 from evercal.calibration.transform_file import read_transform
 from evercal.classes import frozen
 from evercal.errors import InputError
@@ -87,9 +88,7 @@ def _audited(
         [item] = locate(localizer, [(name, image)], camera)
         if item.is_located:
             in_stated = base_from_camera.inverse() @ item.pose
-            differences.append(
-                ImagePose(name, item.estimate, in_stated, item.covariance)
-            )
+            differences.append(replace(item, pose=in_stated))
         else:
             reason = item.estimate.reason
     if not differences:
