@@ -130,7 +130,7 @@ def robust_fit(
     for _ in range(_MAX_ROUNDS):
         levels = estimate_levels(_judges(equation, inliers).system(at), levels)
         at = refine(equation, at, levels, inliers)
-        distance2 = _distances(equation, at, levels, inliers)
+        distance2 = _distances(equation, at, levels, inliers)[0]
         freedom = max(6 * int(inliers.sum()) - equation.unknowns, 2)
         limit = 6 * f.ppf(1 - _REJECTION / len(inliers), 6, freedom)
         selected = distance2 < limit
@@ -227,13 +227,14 @@ def _result(
     information = np.zeros(len(use))
     shares = np.trace(gain[:, :12] @ used.jacobian[:, :, :12], axis1=1, axis2=2)
     information[use] = shares / 12
+    distance2, residual = _distances(equation, at, levels, use)
     return HandEyeFit(
         at=at,
         covariance=covariance,
         levels=levels,
         inliers=use,
-        residual=predicted(equation, at, levels, use)[0],
-        distance2=_distances(equation, at, levels, use),
+        residual=residual,
+        distance2=distance2,
         contributions=contributions,
         moved=moved,
         information=information,
@@ -242,8 +243,11 @@ def _result(
 
 def _distances(
     equation: PoseEquation, at: Unknowns, levels: Array, use: BoolArray
-) -> Array:
-    """(n,) squared Mahalanobis distances of each pose from what the other used ones predict."""
+) -> tuple[Array, Array]:
+    """Squared Mahalanobis distances (n,) of each pose from what the other used ones predict.
+
+    Also return the residuals (n, 6) of `predicted`.
+    """
     used = equation[use].system(at)
     noise = Noise(used, levels)
     weighted = noise.weighted(used.jacobian)
@@ -260,10 +264,10 @@ def _distances(
     distance2[use] = (pull * np.linalg.solve(own, pull)).sum((1, 2))
     residual, left = predicted(equation, at, levels, use)
     slope = equation.system(at).jacobian
-    spread = (1 + 1e-3) * left + slope @ covariance @ slope.transpose(0, 2, 1)
-    whitened = np.linalg.solve(spread, residual[..., None])[..., 0]
+    expected = (1 + 1e-3) * left + slope @ covariance @ slope.transpose(0, 2, 1)
+    whitened = np.linalg.solve(expected, residual[..., None])[..., 0]
     distance2[~use] = (residual * whitened).sum(1)[~use]
-    return distance2
+    return distance2, residual
 
 
 def predicted(
