@@ -58,13 +58,15 @@ class List(Action):
             scenes.append(
                 {
                     "name": scene.name,
+                    "base": scene.base,
                     "keyframes": keyframes,
                     "landmarks": scene.landmarks,
                     "memory_bytes": memory,
                 }
             )
             counts = f"{keyframes} keyframes, {scene.landmarks:,} landmarks"
-            lines.append(f"{scene.name}: {counts}, {size(memory)}")
+            base = f", base {scene.base}" if scene.base else ""
+            lines.append(f"{scene.name}: {counts}, {size(memory)}{base}")
         if not lines:
             lines.append(f"{self.store}: no scene")
         self.answer({"store": str(self.store), "scenes": scenes}, *lines)
