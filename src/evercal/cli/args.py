@@ -16,7 +16,6 @@ from evercal.cli.console import print_json, print_next, say
 from evercal.errors import InputError
 from evercal.processes import cores
 from evercal.robot.frame_names import FrameNames
-from evercal.typing import Strings
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     from evercal.recordings import Recording
     from evercal.reports.inspected import LearnedLocalizer
     from evercal.robot.pose_errors import ArmErrors
+    from evercal.typing import Strings
 
 MAP = "evercal"
 """The strategy of a map."""
@@ -263,7 +263,7 @@ def strategy_of(store: Path) -> str | None:
 
 
 def open_localizer(
-    store: Path, device: str = "auto", scenes: Strings = ()
+    store: Path, device: str = "auto", scenes: "Strings" = ()
 ) -> "LearnedLocalizer":
     """The localizer of a map, or of a store of networks on a device."""
     if strategy_of(store) in (MAP, None):
@@ -277,7 +277,7 @@ def open_localizer(
     return open_networks(store, device)
 
 
-def open_map(store: Path, scenes: Strings = ()) -> "Localizer":
+def open_map(store: Path, scenes: "Strings" = ()) -> "Localizer":
     """The localizer of some scenes of a map, or of all; a store of networks is refused."""
     strategy = strategy_of(store)
     if strategy not in (MAP, None):
