@@ -82,7 +82,7 @@ def test_sigmas_are_root_mean_squares_over_the_axes() -> None:
         ({"child_frame": "panda_hand"}, "'frames' names other frames"),
         ({"child_frame": "panda_hand", "frames": SAME}, "both called"),
         ({"frames": {"base": "a", "gripper": "a"}}, "both called 'a'"),
-        ({"frames": ["base"]}, "wrong kind"),
+        ({"frames": 5}, "wrong kind"),
         ({"frames": {"tool": "tcp"}}, "wrong kind"),
         ({"source": 5}, "'source' is an object"),
         ({"joint_covariance": []}, "the covariance of 2 joints is"),

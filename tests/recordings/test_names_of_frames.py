@@ -1,5 +1,6 @@
 """Recordings know the frames that their files name, and are told the others."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,19 @@ def test_a_folder_of_plain_poses_is_told_its_names(tmp_path: Path) -> None:
         InputError, match=r"`base_frame` base: .*copy states table; leave"
     ):
         load_recording(tmp_path / "copy", options=other)
+
+
+@pytest.mark.parametrize("names", [5, ["base"], {"tool": "tcp"}])
+def test_names_of_another_kind_are_one_line(tmp_path: Path, names: object) -> None:
+    rows = "".join(f"{i}.png,{i / 10},0,0,1,0,0,0\n" for i in range(3))
+    table = "image,x,y,z,qw,qx,qy,qz\n" + rows
+    root = folder(tmp_path, "base_from_gripper.csv", table)
+    generic.write(tmp_path / "copy", load_recording(root))
+    file = tmp_path / "copy" / "scene.json"
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps({**content, "frame_names": names}))
+    with pytest.raises(InputError, match=r"scene\.json: "):
+        load_recording(tmp_path / "copy")
 
 
 @pytest.mark.parametrize("owner", ["gripper", "camera"])

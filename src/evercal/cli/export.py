@@ -50,7 +50,7 @@ class Export(args.Verb):
     via_optical: bool = False
     """With --via: both frames have the same origin."""
     robot_frame: args.Frame = None
-    """For easy_handeye: gripper frame of a fixed camera, else base frame."""
+    """For easy_handeye: new name of the gripper frame of a fixed camera, else of the base frame."""
     robot_poses: args.File = None
     """Gripper pose of every image: moveit_samples, or tum, colmap, nerfstudio on the arm."""
     target_poses: args.File = None

@@ -49,7 +49,7 @@ class FrameNames:
     def from_dict(cls, names: Any) -> Self:
         """The inverse of `asdict`; other values raise ValueError."""
         try:
-            return cls(**{role: str(name or "") for role, name in names.items()})
+            return cls(**{role: str(name or "") for role, name in dict(names).items()})
         except InputError as error:
             raise ValueError(str(error)) from None
 

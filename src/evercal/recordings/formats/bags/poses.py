@@ -250,8 +250,7 @@ def poses_at_images(
             f" `gripper_frame` {camera_frame}"
         )
     names = FrameNames(base, "" if owner == "camera" else gripper)
-    stated = RobotPoses(None, None, poses, frames=names)
-    return ImagePoses(stated, valid, owner, notes)
+    return ImagePoses(RobotPoses(None, None, poses, frames=names), valid, owner, notes)
 
 
 def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[_TfTree, Array]:
