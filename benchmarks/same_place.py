@@ -3,13 +3,14 @@
 Virtual cells are learned twice: with the base moved between, by two robots, with things moved as
 well, in one base, and beside a twin that has the same furniture and other things. Images are taken
 in the second state and asked for in the second base. Each row is also measured without what
-learning knows of places.
+learning knows of places, and where images exclude no scene.
 """
 
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest.mock import patch
 
 import numpy as np
 from numpy.random import Generator, default_rng
@@ -18,6 +19,7 @@ from benchmarks.rows import Row, once, save
 from evercal import Map
 from evercal.classes import frozen
 from evercal.geometry import SE3, UncertainPose, pose_distance
+from evercal.localization import other_bases
 from evercal.localization.acceptance import APART_SIGMAS
 from evercal.localization.localizer import Localizer
 from evercal.recordings import Frame, Recording
@@ -48,6 +50,8 @@ class Case:
     """Share of the things that are elsewhere in the second scene."""
     twin: bool = False
     """Whether the second scene is another cell, with other things."""
+    alike: float = 0.0
+    """Share of the things that stand in the same place of another room."""
 
 
 CASES = [
@@ -57,11 +61,15 @@ CASES = [
     *(Case("two robots, things moved", 1.0, np.pi, share) for share in (0.3, 0.6)),
     *(Case("twin", 0.02, twin=True) for _ in range(2)),
     *(Case("same base", things=share) for share in (0.0, 0.0, 0.6)),
+    *(
+        Case("another room, same things", 0.02, alike=share)
+        for share in (0.1, 0.2, 0.6)
+    ),
 ]
 
 
 def run(out: Path = Path("runs/same-place")) -> None:
-    """Learn 20 cells twice, and locate ten images of each in the second state.
+    """Learn 23 cells twice, and locate ten images of each in the second state.
 
     Args:
         out: Folder of the rows; complete ones are not repeated.
@@ -107,6 +115,10 @@ def measured(case: Case, seed: int) -> list[Row]:
             counts = Counter(outcome(localizer, frame) for frame in recording.test)
             row: Row = {"kind": case.kind, "seed": seed, "map": name, "cells": 1}
             rows.append(row | {key: counts[key] for key in OUTCOMES})
+        with patch.object(other_bases, "FAR_BETTER", 0.0):
+            counts = Counter(outcome(cell.localizer, frame) for frame in recording.test)
+        row = {"kind": case.kind, "seed": seed, "map": "no exclusion", "cells": 1}
+        rows.append(row | {key: counts[key] for key in OUTCOMES})
     return rows
 
 
@@ -127,6 +139,12 @@ def changed(room: BoxRoom, case: Case, rng: Generator) -> BoxRoom:
     other = BoxRoom.__new__(BoxRoom)
     vars(other).update(vars(room))
     things = room.surfaces[-THINGS:]
+    around = room.surfaces[:-THINGS]
+    if case.alike:
+        another = cell_room(room.seed + 500).surfaces
+        around = another[:-THINGS]
+        same = int(case.alike * THINGS / 6) * 6
+        things = [*things[:same], *another[-THINGS:][same:]]
     if case.twin:
         things = cell_room(room.seed + 500).surfaces[-THINGS:]
     moved = []
@@ -136,7 +154,7 @@ def changed(room: BoxRoom, case: Case, rng: Generator) -> BoxRoom:
             shift[:2] = rng.uniform(-0.15, 0.15, 2)
         for surface in things[box : box + 6]:
             moved.append(replace(surface, corner_m=surface.corner_m + shift))
-    other.surfaces = [*room.surfaces[:-THINGS], *moved]
+    other.surfaces = [*around, *moved]
     return other
 
 
