@@ -234,18 +234,14 @@ class Cell:
         self.path = root
         self.scenes = scenes
 
-    def learn(self, _: object, name: str, on_progress: object) -> Any:
-        self.scenes = (*self.scenes, name)
+    def learn(
+        self, _: object, name: str, replace: str | None, on_progress: object
+    ) -> Any:
+        kept = [scene for scene in self.scenes if scene != replace]
+        self.scenes = (*kept, name)
 
     def calibration(self, scene: str) -> Calibration:
         return calibration(scene)
-
-    def remove(self, name: str) -> None:
-        self.scenes = tuple(scene for scene in self.scenes if scene != name)
-
-    def rename(self, name: str, new: str) -> None:
-        self.remove(name)
-        self.scenes = (*self.scenes, new)
 
 
 def test_samples_learned_again_replace_their_scene_and_no_other(

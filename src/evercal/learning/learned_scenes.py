@@ -142,6 +142,7 @@ class LearnedScenes:
         recording: PathLike | Recording,
         *,
         name: str | None = None,
+        replace: str | None = None,
         errors: ArmErrors | None = None,
         on_progress: OnProgress | None = None,
     ) -> Calibration:
@@ -154,6 +155,7 @@ class LearnedScenes:
             recording: Images of the fixed camera and `base_from_gripper` at each, or their path.
                 The gripper turns the thing by 20 degrees and more about two axes.
             name: Of the scene. Default: the recording's name.
+            replace: Name of a scene that the new one replaces.
             errors: What is known of the arm.
             on_progress: Called with the current step, how much of it is done, and its total.
                 Default: bars on stderr.
@@ -171,7 +173,7 @@ class LearnedScenes:
         def learned(named: Recording, step: OnProgress) -> tuple[SceneMap, LearnReport]:
             return learn_held_thing(named, self._store.contents, step, errors)
 
-        report = self._add(recording, name, learned, on_progress)
+        report = self._add(recording, name, learned, on_progress, (None, replace))
         return learned_calibration(self.path, report.scene)
 
     def _add(

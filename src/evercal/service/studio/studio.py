@@ -238,7 +238,7 @@ class Studio:
     def learn(self, on_step: OnStep, which: Which = "wrist") -> str:
         """Learn the recording and calibrate the camera on the gripper, or one that sees the thing.
 
-        The scene that the studio learned before is replaced once the new one is in the map.
+        The scene that the studio learned before is replaced.
         """
         folder = self.recording(which)
         table = self._table_sha256(which)
@@ -249,12 +249,9 @@ class Studio:
             cell = self.thing
             learn = cell.eye_to_hand
             old = next(iter(cell.scenes), None)
-        scene = _free_name(folder.name, cell.scenes)
-        learn(folder, name=scene, on_progress=on_step)
-        if old is not None:
-            cell.remove(old)
-            cell.rename(scene, old)
-        calibration = cell.calibration(old or scene)
+        scene = old or _free_name(folder.name, cell.scenes)
+        learn(folder, name=scene, replace=old, on_progress=on_step)
+        calibration = cell.calibration(scene)
         self._write(which, calibration, **{_TABLE: table})
         frames = calibration.source["frames"]
         return f"Learned {frames} images; wrote {self.calibration_file(which)}."
