@@ -156,11 +156,14 @@ class Map(LearnedScenes):
         Raises:
             InputError: No image was located, or unusable images or poses.
         """
+        arguments = locals()
         from evercal.calibration.from_images import calibrate
         from evercal.calibration.image_source import Images
+        from evercal.storage.provenance import call
 
-        given = Images.of(images, camera, robot_poses, frames=frames)
-        return calibrate(self.localizer, given, mount, on_image=on_image)
+        with call(("Map.calibrate",), {**arguments, "map": self.path}):
+            given = Images.of(images, camera, robot_poses, frames=frames)
+            return calibrate(self.localizer, given, mount, on_image=on_image)
 
     def calibration(self, scene: str | None = None) -> Calibration:
         """The `gripper_from_camera` that learning a wrist recording has estimated.

@@ -14,7 +14,7 @@ from evercal.calibration.calibration import (
     JointOffset,
     read_calibration,
 )
-from evercal.calibration.checks import checks_of
+from evercal.calibration.checks import Checks
 from evercal.calibration.verdict import TIERS, expected_error, tier, verdict
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, cross_matrix, pose_distance
@@ -32,7 +32,7 @@ def example() -> Calibration:
         Camera(640, 480, 600, 601, 320, 240),
         (ImageUse("a.png", True, "", 0.5, 0.1), ImageUse("b.png", False, "blurred")),
         (ErrorTerm("map", 0.3, 0.01),),
-        checks_of({"held_out_mm": 1.5}),
+        Checks.from_dict({"held_out_mm": 1.5}),
         "good for bin picking",
         {"command": "solve"},
         "2026-01-01T00:00:00+00:00",
@@ -117,7 +117,7 @@ def calibration(mm: float, deg: float, **checks: float) -> Calibration:
         "eye_in_hand",
         SE3.identity(),
         np.diag(axes**2),
-        checks=checks_of(checks),
+        checks=Checks.from_dict(checks),
     )
 
 
@@ -204,7 +204,7 @@ def test_a_camera_that_is_known_best_at_the_target_counts_where_it_is() -> None:
 def test_an_error_of_just_a_bound_is_not_below_it() -> None:
     small = calibration(0.1, 0.01)
     for checks in ({"repeatability_mm": 2.0}, {"repeatability_deg": 0.2}):
-        assert tier(replace(small, checks=checks_of(checks))) is TIERS[1]
+        assert tier(replace(small, checks=Checks.from_dict(checks))) is TIERS[1]
 
 
 def test_a_rotation_error_counts_at_the_target() -> None:
@@ -214,5 +214,5 @@ def test_a_rotation_error_counts_at_the_target() -> None:
     moved = 2000 * np.deg2rad(0.1) * np.sqrt(2 / 3)
     assert expected_error(far)[0] == pytest.approx(np.hypot(0.5, moved))
     assert "2.00 m from the camera" in verdict(
-        replace(far, checks=checks_of({"target_m": 2.0}))
+        replace(far, checks=Checks.from_dict({"target_m": 2.0}))
     )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evercal.calibration.calibration import Calibration, read_calibration
-from evercal.calibration.checks import LearnedChecks, PairChecks
+from evercal.calibration.checks import Checks
 from evercal.calibration.export.formats import export_files
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_distance_mm_deg
@@ -93,7 +93,7 @@ def test_a_turn_about_the_last_axis_is_the_zero_of_a_joint() -> None:
 def test_points_are_compared_at_the_working_distance() -> None:
     other = moved(0, 0, 0, 0.002, 0, 0)
     near = example().distance(other, 0.3)
-    far = replace(example(), checks=PairChecks(target_m=1.2)).distance(other)
+    far = replace(example(), checks=Checks(target_m=1.2)).distance(other)
     assert near.rays_mm[0] == pytest.approx(0.6, rel=0.1)
     assert far.rays_mm[0] == pytest.approx(2.4, rel=0.1)
     assert example().distance(other).notes[0].startswith("no working distance")
@@ -110,7 +110,7 @@ def test_without_intrinsics_frames_are_compared() -> None:
 
 def test_errors_of_one_map_cancel() -> None:
     scatter = np.diag(np.repeat([1e-4, 1e-4], 3) ** 2).tolist()
-    checks = LearnedChecks(images_used=20, image_scatter=scatter)
+    checks = Checks(images_used=20, image_scatter=scatter)
     first = replace(example(), checks=checks, source={"map": "a"})
     same = first.distance(replace(moved(0.002, 0, 0, 0, 0, 0), **vars_of(first)))
     other = first.distance(moved(0.002, 0, 0, 0, 0, 0))

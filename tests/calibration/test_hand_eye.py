@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from evercal.calibration.from_map.hand_eye import verdict_of
-from evercal.calibration.learned import _of_version_0_1, calibration_at
+from evercal.calibration.learned import calibration_at, calibration_of
 from evercal.calibration.verdict import TIERS, tier
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance
@@ -119,19 +119,22 @@ def test_the_map_keeps_the_calibration(learned: Learned, tmp_path: Path) -> None
     assert sentences == "Do not rely on it: the clocks differ. Turn more."
 
 
-def test_a_report_written_before_version_0_2_gives_the_same_calibration(
-    learned: Learned,
-) -> None:
+def test_a_report_is_read_again(learned: Learned) -> None:
     folder, report = learned
-    _, camera, stored = stored_scenes(folder)[0]
-    del stored["calibration"]
-    # Such a report does not hold the stated intrinsics.
-    expected = replace(Map.open(folder).calibration(), lenses={})
-    again = _of_version_0_1(stored)
-    assert replace(again, camera=camera).to_dict() == expected.to_dict()
+    [stored] = stored_scenes(folder).values()
+    stored.pop("made", None)
     assert json.loads(json.dumps(report.to_dict())) == stored
-    read = LearnReport.from_stored(report.stored())
+    read = LearnReport.from_stored(report.to_dict())
     assert json.loads(json.dumps(read.to_dict())) == stored
+    # Version 0.2.0 stored the calibration beside how it was estimated.
+    calibration = Map.open(folder).calibration()
+    report_before = dict(stored["hand_eye"])
+    beside = {name: report_before.pop(name) for name in calibration.to_dict()}
+    before = {**stored, "hand_eye": report_before, "calibration": beside}
+    assert calibration_of(before).to_dict() == calibration.to_dict()
+    del before["calibration"]
+    with pytest.raises(InputError, match=r"before version 0\.2; learn it again"):
+        calibration_of(before)
 
 
 def test_a_map_without_gripper_poses_has_no_calibration(

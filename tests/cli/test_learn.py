@@ -20,7 +20,7 @@ from evercal.mapping.store import MapStore
 from evercal.recordings.samples import CELL
 
 KEYS = "scene seconds iterations memory_bytes head_bytes frames_kept landmarks train_frames"
-KEYS += " held_out_frames adjusted hand_eye warnings same_place"
+KEYS += " held_out_frames adjusted hand_eye warnings same_place set_aside"
 ADJUSTED = "common_translation_mm common_rotation_deg focal_percent residual_px"
 
 
@@ -40,6 +40,8 @@ def test_two_scenes_are_learned_and_reported(run, learned, rooms, tmp_path):
     first, second, *_, last = text.splitlines()
     assert first == "box-room-41: 24 training frames"
     assert second.startswith("mapped box-room-41: 20 images, ")
+    assert text.count("\n  set aside    ") == 4
+    assert " deg from its stated pose" in text
     assert "move the corners" not in text
     assert last == f"next: evercal evaluate {store} {rooms[0]}"
     copy = shutil.copytree(store, tmp_path / "copy")
@@ -49,6 +51,7 @@ def test_two_scenes_are_learned_and_reported(run, learned, rooms, tmp_path):
     assert report["adjusted"].keys() >= set(ADJUSTED.split())
     assert report["scene"] == "cell"
     assert report["landmarks"] > 50
+    assert [*map(len, report["set_aside"].values())] == [2, 2, 2, 2]
     assert report["iterations"] == report["head_bytes"] == 0
     assert report["hand_eye"] is None
     assert len(ran.err) == 1  # the line about frames; the rest is progress
@@ -65,6 +68,8 @@ def test_calibration_has_the_estimated_transform_and_the_adjusted_camera(
     ran = run("learn", tmp_path / "s", wrist, "--every", 2, "--calibration", out)
     assert ran.code == 0, ran.err
     assert "gripper_from_camera: (" in ran.out
+    assert "set aside" not in ran.out
+    assert "  left out     half of the poses are predicted within " in ran.out
     assert ran.out.splitlines()[-2] == f"wrote {out}"
     calibration = read_calibration(out)
     truth = json.loads((CELL / "truth.json").read_text())["gripper_from_camera"]

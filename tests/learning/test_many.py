@@ -160,7 +160,7 @@ def test_a_results_file_is_used_if_it_is_that_of_the_recording(
     assert not caplog.text
     assert kept.report is not None
     assert expected.report is not None
-    assert kept.report.stored() == json.loads(json.dumps(expected.report.stored()))
+    assert kept.report.to_dict() == json.loads(json.dumps(expected.report.to_dict()))
 
 
 def test_names_are_checked_before_anything_is_learned(

@@ -13,7 +13,7 @@ from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.board_poses import board_poses
 from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.calibration import Calibration, ImageUse
-from evercal.calibration.checks import checks_of
+from evercal.calibration.checks import Checks
 from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.mapping.map_frame import MapFrame
@@ -221,7 +221,7 @@ def test_corners_are_projected_with_the_estimated_size(tmp_path: Path) -> None:
     stated = {"translation_m": [0.01, 0.02, 0.5], "quaternion_wxyz": [1, 0, 0, 0]}
     own = calibration(
         {"images/a.png": True},
-        checks=checks_of(
+        checks=Checks.from_dict(
             {"camera_from_board": {"images/a.png": stated}, "scale": 1 / 1.02}
         ),
         source={"command": "solve", "camera_poses": "board.json"},

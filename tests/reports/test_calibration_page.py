@@ -13,7 +13,7 @@ from evercal.calibration.calibration import (
     ImageUse,
     JointOffset,
 )
-from evercal.calibration.checks import checks_of
+from evercal.calibration.checks import Checks
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.reports.calibration_images import AnnotatedImages
@@ -63,7 +63,7 @@ def full(**changes: Any) -> Calibration:
             ErrorTerm("landmarks and lens", 0.2, 0.001),
             ErrorTerm("scatter", 0.05, 0.0002),
         ),
-        checks_of(
+        Checks.from_dict(
             {
                 "repeatability_mm": 0.31,
                 "repeatability_deg": 0.013,
@@ -131,7 +131,7 @@ def test_verdict_comes_first() -> None:
 )
 def test_verdict_has_its_colour(mm: float, level: str, headline: str) -> None:
     reader, page = read(
-        full(checks=checks_of({"repeatability_mm": 2 * mm}), verdict="")
+        full(checks=Checks.from_dict({"repeatability_mm": 2 * mm}), verdict="")
     )
     assert f'<header class="{level}"' in page.html
     assert reader.text("h1").startswith(headline)
@@ -197,7 +197,7 @@ def test_checks_ellipsoid_and_source_are_shown() -> None:
         ("image size (px)", "160x120"),
         ("fx (px)", "150.0000"),
         ("k1", "0.1000"),
-        ("repeatability mm", "0.31"),
+        ("repeatability (mm)", "0.31"),
     ):
         assert reader.row(name)[1] == value
     assert page.missing == ()
@@ -238,7 +238,7 @@ def test_all_strings_are_escaped() -> None:
         frames=FrameNames(gripper=MARKUP, camera="c" + MARKUP),
         images=(ImageUse(MARKUP, False, MARKUP, 1.0, 1.0),),
         error_terms=(ErrorTerm(MARKUP, 1.0, 1.0),),
-        checks=checks_of({MARKUP: MARKUP}),
+        checks=Checks.from_dict({MARKUP: MARKUP}),
         verdict=MARKUP,
         source={MARKUP: MARKUP, "deep": {"a": [MARKUP]}},
         created=MARKUP,
@@ -353,7 +353,7 @@ def test_boards_show_what_each_image_contributes() -> None:
         "information_percent": {"shots/a.png": 30.0},
         "leave_one_out_mm": {"shots/a.png": 0.2},
     }
-    reader, _ = read(full(checks=checks_of(checks)))
+    reader, _ = read(full(checks=Checks.from_dict(checks)))
     assert reader.row("fx (px)") == ["fx (px)", "150.0000", "0.5000"]
     [row] = [row for row in reader.rows if row[1:2] == ["a.png"]]
     assert row[-2:] == ["30.0", "0.200"]
@@ -366,7 +366,9 @@ def test_joints_of_the_arm_are_listed_with_what_would_close_them() -> None:
         JointOffset("rail", -0.0031, 0.0004, is_angle=False),
     )
     checks = {"joints_move_mm": [4.5, 6.25]}
-    own = full(joints=joints, joint_covariance=np.eye(3), checks=checks_of(checks))
+    own = full(
+        joints=joints, joint_covariance=np.eye(3), checks=Checks.from_dict(checks)
+    )
     reader, page = read(own)
     assert [
         "pan (deg)",

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evercal.calibration.checks import checks_of
+from evercal.calibration.checks import Checks
 from evercal.evaluation import FrameResult
 from evercal.reports.demo_page import DemoResult, FixedCamera, LearnedRoom, demo_page
 from evercal.reports.page import Picture, Table
@@ -58,7 +58,9 @@ WIDE = Table([f"column {i}" for i in range(14)], [["evercal", *np.arange(13) / 7
 PAGES = {
     "good": lambda: read(full())[1].html,
     "bad": lambda: (
-        read(full(checks=checks_of({"repeatability_mm": 100.0}), verdict=""))[1].html
+        read(full(checks=Checks.from_dict({"repeatability_mm": 100.0}), verdict=""))[
+            1
+        ].html
     ),
     "solved": lambda: read(solved(), name="a_long_name_without_a_space" * 4)[1].html,
     "demo": demonstrated,

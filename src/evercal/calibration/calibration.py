@@ -9,7 +9,8 @@
      "lens": "estimated", "lenses": {"stated": {...}, "estimated": {...}},
      "for_stated_lens": {"matrix": [4][4], ..., "left_deg": x}, "images": [...],
      "error_terms": [...], "checks": {...}, "joints": [...], "joint_covariance": [k][k],
-     "verdict": "...", "source": {...}, "created": "...", "verifications": [...]}
+     "verdict": "...", "source": {...}, "created": "...", "made": {...},
+     "verifications": [...]}
 
 Metres, radians, quaternions w, x, y, z, OpenCV camera axes. The pose belongs to `camera`, which is
 the one of `lenses` that `lens` names. `matrix`, `meaning`, `lens`, `for_stated_lens` and the sigmas
@@ -19,12 +20,12 @@ words base, gripper and camera where `frames` does not know the name.
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, get_args
 
 import numpy as np
 
-from evercal.calibration.checks import Checks, checks_of
+from evercal.calibration.checks import Checks
 from evercal.calibration.framed_pose import FramedPose
 from evercal.calibration.framed_pose import ImageUse as ImageUse
 from evercal.calibration.framed_pose import JointOffset as JointOffset
@@ -35,6 +36,7 @@ from evercal.geometry import SE3, Camera, UncertainPose, axis_deviation, pose_di
 from evercal.robot.frame_names import FrameNames
 from evercal.robot.mount import MountName, mount_named
 from evercal.storage import write_json
+from evercal.storage.provenance import Made, current, now
 from evercal.storage.records import of_format, read_record
 from evercal.typing import Array, JsonObject, PathLike
 
@@ -93,20 +95,22 @@ class Calibration(FramedPose):
     error_terms: tuple[ErrorTerm, ...] = ()
     """Parts of the covariance by cause; from images, those of `CovarianceTerm` and the scatter."""
     checks: Checks = field(default_factory=Checks)
-    """What it was compared with: `ImageChecks`, `PairChecks` or `LearnedChecks`, by its origin."""
+    """What it was compared with."""
     verdict: str = ""
     """Uses that it serves, one or two sentences."""
     source: Mapping[str, Any] = field(default_factory=dict)
     """Command, store, scene and options, JSON values."""
-    created: str = ""
+    created: str = field(default_factory=now)
     """ISO 8601 time with zone."""
     verifications: tuple[Mapping[str, Any], ...] = ()
     """Tests by data that it had not seen, see `Verification.to_dict`."""
+    made: Made | None = field(default_factory=current)
+    """Version, command and inputs; None in files of older versions."""
 
     def __post_init__(self) -> None:
         mount_named(self.mount)
         if isinstance(self.checks, Mapping):
-            object.__setattr__(self, "checks", checks_of(self.checks))
+            object.__setattr__(self, "checks", Checks.from_dict(self.checks))
         covariance = np.array(self.covariance, float)
         if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
             raise ValueError(
@@ -182,6 +186,7 @@ class Calibration(FramedPose):
             "source": dict(self.source),
             "created": self.created,
             "verifications": list(self.verifications),
+            "made": self.made and asdict(self.made),
         }
 
     @classmethod
@@ -217,13 +222,14 @@ class Calibration(FramedPose):
             lenses={k: Camera.from_dict(v) for k, v in data.get("lenses", {}).items()},
             images=tuple(ImageUse(**row) for row in data.get("images", [])),
             error_terms=tuple(ErrorTerm(**row) for row in data.get("error_terms", [])),
-            checks=checks_of(data.get("checks", {})),
+            checks=Checks.from_dict(data.get("checks", {})),
             joints=tuple(JointOffset(**row) for row in data.get("joints", [])),
             joint_covariance=np.array(data.get("joint_covariance", []), float),
             verdict=str(data.get("verdict", "")),
             source=data.get("source", {}),
             created=str(data.get("created", "")),
             verifications=tuple(map(dict, data.get("verifications", []))),
+            made=Made.from_dict(data.get("made")),
         )
 
     def write(self, path: PathLike) -> None:

@@ -1,4 +1,4 @@
-"""What a calibration was compared with: a record for each origin, in the order of its JSON."""
+"""What a calibration was compared with, in the order of its JSON."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -30,6 +30,8 @@ class Checks:
     held_out_deg: float | None = None
     held_out_rms_mm: float | None = None
     held_out_rms_deg: float | None = None
+    held_out_sigmas: float | None = None
+    """Root mean square error of held-out poses per axis, in stated standard deviations."""
     repeatability_mm: float | None = None
     """Distance between the calibrations from two halves of the data."""
     repeatability_deg: float | None = None
@@ -78,24 +80,3 @@ class Checks:
         known = {name: value for name, value in values.items() if name in names}
         other = {name: value for name, value in values.items() if name not in names}
         return cls(**known, other=other)
-
-
-class ImageChecks(Checks):
-    """Checks of `calibrate`: a camera by images of a map."""
-
-
-class LearnedChecks(Checks):
-    """Checks of `learn` and `eye-to-hand`: a camera from nothing."""
-
-
-class PairChecks(Checks):
-    """Checks of `solve`: a camera by pose pairs."""
-
-
-def checks_of(values: Mapping[str, Any]) -> Checks:
-    """The record of JSON values, by the keys that only one origin has."""
-    if "images_given" in values:
-        return ImageChecks.from_dict(values)
-    if "images_used" in values or "joints_move_mm" in values:
-        return LearnedChecks.from_dict(values)
-    return PairChecks.from_dict(values)

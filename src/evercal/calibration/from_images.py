@@ -8,13 +8,12 @@ with the grip if that has changed, see `held_thing.held_again`.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from evercal.calibration.calibration import Calibration, ErrorTerm, largest_term
-from evercal.calibration.checks import ImageChecks
+from evercal.calibration.checks import Checks
 from evercal.calibration.from_map.spots import from_many_spots, from_one_spot
 from evercal.calibration.held_thing.held_again import HeldAgain, held_again
 from evercal.calibration.image_source import Images
@@ -130,7 +129,6 @@ def calibrate(
         error_terms=uncertainty.terms,
         checks=_checks(view),
         source=source,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
     ).for_lens("estimated")
     advice = _advice(calibration, fused, estimated, stated)
     return replace(calibration, verdict=" ".join([verdict(calibration), *advice]))
@@ -202,11 +200,11 @@ def _names(given: Images, scene: "SceneMap", held: bool) -> FrameNames:
     return names
 
 
-def _checks(view: _View) -> ImageChecks:
+def _checks(view: _View) -> Checks:
     fused = view.fused
     poses = poses_of(fused.select(view.in_parent))
     millimetres, degrees = halves_apart(poses) or (None, None)
-    return ImageChecks(
+    return Checks(
         images_given=len(view.in_parent),
         images_used=int(fused.used.sum()),
         # `check` compares it with the scatter of later images.

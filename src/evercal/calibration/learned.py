@@ -1,21 +1,14 @@
 """The calibration that a map keeps of a scene that was learned from gripper poses."""
 
 import os
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from evercal.calibration.calibration import (
-    FORMAT,
-    VERSION,
-    Calibration,
-    read_calibration,
-)
+from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.errors import InputError
-from evercal.robot.mount import mount_named
+from evercal.storage.provenance import Made
 from evercal.storage.stages import is_store
-from evercal.typing import PathLike
+from evercal.typing import JsonObject, PathLike
 
 
 def calibration_at(path: PathLike) -> Calibration:
@@ -32,12 +25,8 @@ def learned_calibration(root: Path, scene: str | None = None) -> Calibration:
     """Return the calibration of a scene, by default the only one with gripper poses."""
     from evercal.mapping.store import stored_scenes
 
-    stored = {}
-    wrist = []
-    for name, camera, report in stored_scenes(root):
-        stored[name] = (camera, report)
-        if report.get("hand_eye"):
-            wrist.append(name)
+    stored = stored_scenes(root)
+    wrist = [name for name, report in stored.items() if report.get("hand_eye")]
     if scene is not None and scene not in stored:
         raise InputError(f"scene {scene!r}: map {root} has only {', '.join(stored)}")
     if scene is None and len(wrist) > 1:
@@ -52,44 +41,16 @@ def learned_calibration(root: Path, scene: str | None = None) -> Calibration:
             f"{place}: was not learned from gripper poses, so it has no gripper_from_camera; run"
             " 'evercal calibrate' and give its file"
         )
-    camera, report = stored[name]
-    if "calibration" in report:
-        calibration = Calibration.from_dict(report["calibration"])
-    else:
-        calibration = replace(_of_version_0_1(report), camera=camera)
+    calibration = calibration_of(stored[name])
     # The scene may have another name now.
-    source = {**calibration.source, "scene": name}
-    return replace(calibration, source=source)
+    return replace(calibration, source={**calibration.source, "scene": name})
 
 
-def _of_version_0_1(report: Mapping[str, Any]) -> Calibration:
-    """The calibration of a report that states its values, written before version 0.2."""
-    from evercal.calibration.from_map.hand_eye import verdict_of
-
-    values = report["hand_eye"]
-    mount = mount_named(values.get("mount", "eye_in_hand"))
-    checks = {}
-    if values.get("image_scatter"):
-        checks["images_used"] = values["images_located"]
-        checks["image_scatter"] = values["image_scatter"]
-    if values.get("joints_move_mm"):
-        checks["joints_move_mm"] = values["joints_move_mm"]
-    record = {
-        **values,
-        "format": FORMAT,
-        "version": VERSION,
-        "mount": mount.name,
-        "parent_frame": mount.parent,
-        "child_frame": "camera",
-        "checks": checks,
-        "source": {
-            "command": "learn" if mount.moves else "eye-to-hand",
-            "scene": report.get("scene"),
-            "frames": int(report["train_frames"]),
-            "map": values.get("map", ""),
-        },
-    }
+def calibration_of(report: JsonObject) -> Calibration:
+    """The calibration in the report of a scene, with the record of what made it."""
+    record = report.get("calibration", report["hand_eye"])
+    if "format" not in record:
+        raise InputError("it was learned before version 0.2; learn it again")
     calibration = Calibration.from_dict(record)
-    warnings = values.get("warnings", ())
-    sentences = verdict_of(calibration, warnings, values.get("advice", ""))
-    return replace(calibration, verdict=sentences)
+    made = calibration.made or Made.from_dict(report.get("made"))
+    return replace(calibration, made=made)

@@ -79,7 +79,7 @@ def _advice(use: Tier | None) -> str:
         wanted = TIERS[TIERS.index(use) - 1]
     return (
         f"For {wanted.name}: more poses, tilted more about two axes; let the robot stand still at"
-        f" each; use a larger or nearer board."
+        " each; use larger or nearer surfaces with texture, or such a board."
     )
 
 

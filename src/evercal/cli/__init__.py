@@ -80,10 +80,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Its encoding may lack letters of a name; stderr escapes them anyway.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        command = _parse(words, as_json)
+        command = parsed(words, as_json)
         if not isinstance(command, int):
             command.set_limits()
-            command = command.run()
+            command = _run(command, words)
         sys.stdout.flush()  # here, where a closed pipe is handled
         return command
     except InputError as error:
@@ -102,6 +102,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         return 130
+
+
+def _run(command: Any, words: Sequence[str]) -> int:
+    """Run a verb; what it writes records the command."""
+    if not command.writes:
+        return command.run()
+    from evercal.storage.provenance import call
+
+    with call(("evercal", *words), command.given):
+        return command.run()
 
 
 def _discard_stdout() -> None:
@@ -149,7 +159,7 @@ def _help() -> str:
     return "\n".join(lines)
 
 
-def _parse(words: list[str], as_json: bool) -> Any:
+def parsed(words: list[str], as_json: bool = False) -> Any:
     """The command that the words make, or an exit code."""
     if words == ["--version"]:
         # `evercal` is loaded before its folders, which do not import it.

@@ -4,9 +4,9 @@ import math
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, TextIO
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -87,6 +87,8 @@ Device = Annotated[
 class Verb:
     """A verb with its arguments."""
 
+    writes: ClassVar[Strings] = ()
+    """Arguments that name what a verb writes, where it keeps what made it; the result first."""
     json: bool = False
     """Print one JSON object."""
     limits: Annotated[str, shown("NAME=N,...", "(default: none)")] = ""
@@ -95,6 +97,17 @@ class Verb:
     def run(self) -> int:
         """Run and return the exit code."""
         raise NotImplementedError
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """All arguments but those that name what is written."""
+        values = {}
+        for name, value in vars(self).items():
+            if is_dataclass(value):
+                values |= vars(value)
+            elif name not in self.writes:
+                values[name] = value
+        return values
 
     def set_limits(self) -> None:
         """Bound what is read, and threads, also in worker processes; before OpenCV is loaded."""

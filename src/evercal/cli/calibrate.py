@@ -32,6 +32,7 @@ class Calibrate(args.Verb):
     Example: evercal calibrate cell.evercal tripod/ --camera camera.json --out tripod.json
     """
 
+    writes = ("out",)
     store: args.Store
     images: Annotated[Positional[tuple[str, ...]], args.shown("IMAGE...")]
     """Image files or folders of them, all of one camera; or NAME=FOLDER for each camera of a
@@ -166,6 +167,7 @@ def calibration_lines(
             yield f"    of it      {part} ({100 * share:.0f} % of the position's variance)"
     if point is not None:
         yield f"  point        {point.text(calibration.uncertain_pose)}"
+    yield from held_out_lines(calibration)
     checks = calibration.checks
     if checks.repeatability_mm is not None:
         mm = checks.repeatability_mm
@@ -178,6 +180,17 @@ def calibration_lines(
     for image in rejected:
         yield f"    rejected   {image.name}: {image.reason}"
     yield f"  verdict      {calibration.verdict}"
+
+
+def held_out_lines(calibration: "Calibration") -> Iterator[str]:
+    """How well each gripper pose is predicted by the others."""
+    checks = calibration.checks
+    if checks.held_out_mm is None:
+        return
+    error = f"{checks.held_out_mm:.2f} mm and {checks.held_out_deg:.3f} deg"
+    if checks.held_out_sigmas is not None:
+        error += f", {checks.held_out_sigmas:.1f} of their standard deviations"
+    yield f"  left out     half of the poses are predicted within {error}"
 
 
 def lens_lines(calibration: "Calibration") -> Iterator[str]:

@@ -24,6 +24,7 @@ class EyeToHand(args.Verb):
     Example: evercal eye-to-hand recording/ --camera camera.json --out tripod.json
     """
 
+    writes = ("out", "map")
     recording: Annotated[Positional[Path], args.shown("RECORDING")]
     """Folder of images with base_from_gripper.csv or joints.csv, or a bag."""
     out: args.OutFile = Path("calibration.json")

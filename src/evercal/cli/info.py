@@ -8,6 +8,7 @@ from typing import Any
 from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import length, size, table
+from evercal.storage.provenance import Made
 
 MEMORY_FILES = ("keyframes.safetensors", "state.safetensors")
 """Files of the keyframes: of a scene of a map, and of a store of networks."""
@@ -39,6 +40,7 @@ class Info(args.Verb):
         kept = [name for name in sizes if name.endswith(MEMORY_FILES)]
         memory = sum(sizes[name] for name in kept)
         adjusted = [s for s in scenes if s.get("adjusted")]
+        made = [s for s in scenes if s.get("made")]
         record = {
             "store": str(self.store),
             "strategy": strategy,
@@ -57,6 +59,7 @@ class Info(args.Verb):
             f"{size(total)} in all: keyframes {size(memory)}, {network}the rest is the encoder",
             *table(list(map(_content, scenes))),
             *table([adjusted_row(s["name"], s["adjusted"]) for s in adjusted]),
+            *(f"{s['name']}: {Made.from_dict(s['made'])}" for s in made),
             then=("info", self.store, "--check"),
         )
         return 0
@@ -90,6 +93,7 @@ def _map(store: Path) -> tuple[Sequence[dict[str, Any]], int, int, dict[str, int
                 "landmarks": scene.landmarks,
                 "adjusted": report.get("adjusted"),
                 "hand_eye": report.get("hand_eye"),
+                "made": report.get("made"),
             }
         )
     return scenes, opened.contents.short_side, 0, opened.size_bytes()

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import field, fields
 from functools import partial
+from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +14,7 @@ from tyro.conf import Positional, arg
 from evercal.choices import Preset
 from evercal.classes import frozen
 from evercal.cli import args
-from evercal.cli.calibrate import joint_lines, lens_lines
+from evercal.cli.calibrate import held_out_lines, joint_lines, lens_lines
 from evercal.cli.console import require_writable, say, say_notes, size
 from evercal.cli.info import adjusted_row
 from evercal.errors import InputError
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from evercal.learning.report import LearnReport
     from evercal.recordings import Recording
 
+MOST_LINES = 8
+"""Images that were set aside, at most, with a line each; the map keeps the errors of all."""
 FEW_LANDMARKS = 50
 """Landmarks a keyframe; of a dark, overexposed or blurred room with 9, 21, 58 and 83 of them, 50,
 60, 100 and 90 % of the images were located."""
@@ -61,6 +64,7 @@ class Learn(args.Verb):
     Example: evercal learn cell.evercal wrist_recording/ --calibration wrist.json
     """
 
+    writes = ("store", "calibration", "results", "ray")
     store: args.Store
     recordings: Annotated[Positional[tuple[str, ...]], args.shown("RECORDING...")] = ()
     """Folders of recordings, files of bags, or addresses such as s3://bucket/folder."""
@@ -309,6 +313,11 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
     for other in report.same_place:
         if other.same_base:
             yield other.agreement
+    for name, error in [*report.set_aside.items()][:MOST_LINES]:
+        how = "{:.2f} mm and {:.3f} deg from its stated pose".format(
+            *error or (nan, nan)
+        )
+        yield f"  set aside    {name}: located {how}"
     yield from map("warning: {}".format, report.warnings)
     found = report.hand_eye
     if found is not None:
@@ -321,6 +330,7 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
             f" {found.pairs} of {found.of_pairs} image pairs are inliers"
         )
         yield from lens_lines(found.calibration)
+        yield from held_out_lines(found.calibration)
         yield from map("warning: {}".format, found.warnings)
         if found.advice:
             yield f"warning: {found.advice}"

@@ -31,6 +31,7 @@ class Refresh(args.Verb):
     Example: evercal refresh cell.evercal images/
     """
 
+    writes = ("store",)
     store: args.Store
     images: Annotated[
         Positional[tuple[Path, ...]], args.shown("[RECORDING|IMAGE...]")

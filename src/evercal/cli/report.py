@@ -8,6 +8,7 @@ from tyro.conf import Positional, arg
 
 from evercal.classes import frozen
 from evercal.cli import args
+from evercal.cli.again import made_again
 from evercal.cli.console import require_writable
 from evercal.progress import progress_bar
 
@@ -33,6 +34,8 @@ class Report(args.Verb):
     """Images of the camera, or a folder of them."""
     against: Annotated[Path | None, args.shown("OLD.json")] = None
     """Older calibration of the same camera, to compare with."""
+    again: bool = False
+    """Make the calibration again with the recorded command: what differs, and by how much."""
     at: args.At = None
     out: Annotated[Path, arg(metavar="FILE.html")] = Path("report.html")
     """The report, one file including its pictures."""
@@ -57,6 +60,9 @@ class Report(args.Verb):
             older = NamedCalibration(self.against.name, read_calibration(self.against))
         boards = boards_seen(calibration, self.calibration.parent)
         images = self._images(calibration, older and older.calibration, boards)
+        again = ""
+        if self.again:
+            again = made_again(self.calibration, calibration)
         page = calibration_page(
             NamedCalibration(self.calibration.name, calibration),
             images,
@@ -64,6 +70,7 @@ class Report(args.Verb):
             older,
             point,
             bool(boards),
+            again,
         )
         write_bytes(self.out, page.html.encode())
         best = tier(calibration)
@@ -78,6 +85,7 @@ class Report(args.Verb):
             "pictures": list(images.images),
             "against": None,
             "missing": list(page.missing),
+            "again": again,
         }
         if older is not None:
             change = difference(calibration, older.calibration)
@@ -87,6 +95,8 @@ class Report(args.Verb):
         if point is not None:
             record["at"] = point.record(calibration.uncertain_pose)
             lines.append(f"  {point.text(calibration.uncertain_pose)}")
+        if again:
+            lines.append(f"  {again}")
         lines += map("  {}".format, page.missing)
         then = args.export_words(calibration, self.calibration)
         self.answer(record, *lines, f"wrote {self.out}", then=then)

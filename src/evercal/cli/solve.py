@@ -28,6 +28,7 @@ class Solve(args.Verb):
     Example: evercal solve --robot-poses poses.csv --camera-poses board.json --mount eye_in_hand
     """
 
+    writes = ("out",)
     robot_poses: args.InFile
     """base_from_gripper of every image: a pose table, JSON, NPY or NPZ."""
     camera_poses: args.InFile
@@ -55,14 +56,7 @@ class Solve(args.Verb):
         require_writable(self.out, "--out")
         from evercal.calibration.verdict import tier
 
-        source = {
-            "command": "solve",
-            **vars(self),
-            **vars(self.which),
-            "robot_poses": str(self.robot_poses),
-            "camera_poses": str(self.camera_poses),
-        }
-        del source["out"], source["json"], source["which"], source["frames"]
+        source = {"command": "solve"}
         solved = replace(self._solved(), source=source, frames=self.frames.names())
         calibration = self._with_image_paths(solved)
         calibration.write(self.out)
@@ -123,9 +117,6 @@ class Solve(args.Verb):
 def _check_lines(calibration: "Calibration") -> Iterator[str]:
     checks = calibration.checks
     camera = calibration.camera
-    if checks.held_out_mm is not None:
-        error = f"{checks.held_out_mm:.2f} mm and {checks.held_out_deg:.3f} deg"
-        yield f"  left out     half of the poses are predicted within {error}"
     residual = f"{checks.residual_mm:.2f} mm, {checks.residual_deg:.3f} deg"
     yield f"  residuals    {residual} (root mean square)"
     if checks.corner_sigma_px is not None:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from evercal.geometry import SE3, pose_distance
-from evercal.learning.located import localizer_of, located_poses
+from evercal.learning.stated_scatter import localizer_of, located_poses
 from evercal.mapping.built_map import BuiltMap
 from evercal.mapping.scene_map import MapContents
 from evercal.mapping.selection import spread_poses

@@ -25,9 +25,9 @@ from evercal.calibration.held_thing.thing_map import (
 )
 from evercal.errors import InputError
 from evercal.features.encoder import Encoder
-from evercal.learning.located import localizer_of, located_poses
 from evercal.learning.posed import LearnedScene, cleared, require_usable, sized
 from evercal.learning.report import LearnReport
+from evercal.learning.stated_scatter import localizer_of, located_poses
 from evercal.mapping.arm_offsets import with_offsets
 from evercal.mapping.build import MapOptions, build_map
 from evercal.mapping.built_map import BuiltMap

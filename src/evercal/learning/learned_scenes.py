@@ -127,7 +127,9 @@ class LearnedScenes:
             InputError: A recording that cannot be used, a name that is taken, poses that are not in
                 the base of this name, or another process is writing into the map.
         """
+        given = locals()
         from evercal.learning.scene import learn_scene
+        from evercal.storage.provenance import call
 
         def learned(named: Recording, step: OnProgress) -> tuple[SceneMap, LearnReport]:
             contents = self._store.contents
@@ -135,7 +137,9 @@ class LearnedScenes:
                 named, contents, memory, gripper_from_camera, options, step
             )
 
-        return self._add(recording, name, learned, on_progress, (base, replace))
+        with call(("Map.learn",), given):
+            in_map = (base, replace)
+            return self._add(recording, name, learned, on_progress, in_map)
 
     def eye_to_hand(
         self,
@@ -167,13 +171,16 @@ class LearnedScenes:
             InputError: A recording that cannot be used, with the cause; a name that is taken; or
                 another process is writing into the map.
         """
+        given = locals()
         from evercal.calibration.learned import learned_calibration
         from evercal.learning.held_thing import learn_held_thing
+        from evercal.storage.provenance import call
 
         def learned(named: Recording, step: OnProgress) -> tuple[SceneMap, LearnReport]:
             return learn_held_thing(named, self._store.contents, step, errors)
 
-        report = self._add(recording, name, learned, on_progress, (None, replace))
+        with call(("Map.eye_to_hand",), given):
+            report = self._add(recording, name, learned, on_progress, (None, replace))
         return learned_calibration(self.path, report.scene)
 
     def _add(
@@ -211,12 +218,14 @@ class LearnedScenes:
         replaced: str | None = None,
     ) -> LearnReport:
         from evercal.learning.mapped_already import placed
+        from evercal.storage.provenance import recorded
 
         kept = self._store.contents.without(replaced)
         scene, same_place = placed(replace(scene, base=base or ""), kept)
         size = kept.with_scene(scene).memory_bytes
         report = replace(report, memory_bytes=size, same_place=same_place)
-        self._store.commit(scene, report.stored(), replaced)
+        made = {**report.to_dict(), **recorded()}
+        self._store.commit(scene, made, replaced)
         self._changed()
         return report
 
@@ -310,6 +319,7 @@ class LearnedScenes:
         from evercal.calibration.image_source import Images
         from evercal.localization.refreshing import refresh_scene
         from evercal.progress import shown
+        from evercal.storage.provenance import recorded
 
         if isinstance(images, Recording):
             given = [(frame.name, frame.image) for frame in images.train]
@@ -324,7 +334,7 @@ class LearnedScenes:
             cameras = [camera] * len(given)
         with self._store.writing(), shown(on_progress) as step:
             scene, report = refresh_scene(self.localizer, given, cameras, options, step)
-            self._store.refresh(scene, asdict(report))
+            self._store.refresh(scene, {**asdict(report), **recorded()})
         self._changed()
         return report
 

@@ -1,14 +1,19 @@
 """A scene from frames with camera poses, stated or estimated: map, scatter and report."""
 
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import field, replace
 
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
-from evercal.learning.located import localizer_of, located_as_stated
+from evercal.geometry import pose_distance_mm_deg
 from evercal.learning.report import LearnReport
-from evercal.learning.stated_scatter import with_scatter
+from evercal.learning.stated_scatter import (
+    localizer_of,
+    located_as_stated,
+    located_poses,
+    with_scatter,
+)
 from evercal.mapping.build import MapOptions, build_map
 from evercal.mapping.built_map import LENGTHS, BuiltMap
 from evercal.mapping.memory_budget import MemoryBudget
@@ -30,6 +35,8 @@ class LearnedScene:
     split: HeldOutSplit
     metric: bool
     """Whether the recording was in metres."""
+    set_aside: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    """See `LearnReport.set_aside`."""
 
     def report(self, contents: MapContents, began: float) -> LearnReport:
         """The report of a scene that joins `contents`; `began` is a time of `perf_counter`."""
@@ -44,6 +51,7 @@ class LearnedScene:
             frames_kept=len(self.scene.keyframes),
             train_frames=len(self.split.train),
             held_out_frames=len(self.split.held_out),
+            set_aside=self.set_aside,
             landmarks=self.scene.landmarks,
             adjusted=adjusted,
         )
@@ -73,15 +81,22 @@ def learn_posed(
         from evercal.learning.fewest_keyframes import fewest_keyframes
 
         built = built.take(fewest_keyframes(contents, built, split.train, on_progress))
+    held_out = built.corrected(split.held_out)
     scene = with_scatter(
         # Alone in a map, so that it does not depend on the other scenes.
         contents.empty().with_scene(built.scene),
-        built.corrected(split.held_out),
+        held_out,
         left_out=built.left_out(split.train),
         noise=built.independent_noise,
     )
     built = cleared(built, scene, split.train, contents)
-    return LearnedScene(scene, built, split, recording.metric)
+    poses = located_poses(localizer_of(contents, scene), held_out)
+    errors = {}
+    for frame, pose in zip(held_out, poses, strict=True):
+        errors[frame.name] = ()
+        if pose is not None and frame.base_from_camera is not None:
+            errors[frame.name] = pose_distance_mm_deg(pose, frame.base_from_camera)
+    return LearnedScene(scene, built, split, recording.metric, errors)
 
 
 def sized(

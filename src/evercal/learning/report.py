@@ -1,7 +1,7 @@
 """`LearnReport`: the outcome of learning a scene, printed and stored as JSON."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Self
 
 from evercal.classes import frozen
@@ -60,6 +60,9 @@ class LearnReport:
     """Frames that were learned."""
     held_out_frames: int
     """Frames that the scatter of the stated poses was fitted to."""
+    set_aside: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    """Distances of these frames, located in the map, from their stated poses, millimetres in the
+    unit of the recording and degrees: an independent check. Empty of one that is not located."""
     landmarks: int = 0
     """Landmarks of this scene."""
     adjusted: Adjusted | None = None
@@ -94,16 +97,9 @@ class LearnReport:
         values.setdefault("head_bytes", 0)
         return values
 
-    def stored(self) -> dict[str, Any]:
-        """Return `to_dict` with the calibration, as it is stored with the scene."""
-        values = self.to_dict()
-        if self.hand_eye is not None:
-            values["calibration"] = self.hand_eye.calibration.to_dict()
-        return values
-
     @classmethod
     def from_stored(cls, values: Mapping[str, Any]) -> Self:
-        """The inverse of `stored`."""
+        """The inverse of `to_dict`."""
         from evercal.calibration.calibration import Calibration
         from evercal.calibration.from_map.hand_eye import HandEye
 
@@ -111,7 +107,7 @@ class LearnReport:
         if own["adjusted"] is not None:
             own["adjusted"] = Adjusted(**own["adjusted"])
         if own["hand_eye"] is not None:
-            calibration = Calibration.from_dict(values["calibration"])
+            calibration = Calibration.from_dict(own["hand_eye"])
             own["hand_eye"] = HandEye.from_dict(own["hand_eye"], calibration)
         own["same_place"] = tuple(SamePlace(**row) for row in own["same_place"])
         return cls(**own)

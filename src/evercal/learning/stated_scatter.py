@@ -1,7 +1,7 @@
-"""Errors that only the frames of a recording show, estimated when a scene is learned.
+"""Frames of a recording in the map of its scene alone, located or aligned, and what they show.
 
 How far the intrinsics of its camera move from image to image, and how far the stated frame scatters
-about the map.
+about the map. The other scenes of the map are left out, so that a scene does not depend on them.
 """
 
 from collections.abc import Iterator, Sequence
@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evercal.geometry import Camera
-from evercal.localization.answer import in_base
+from evercal.geometry import SE3, Camera
+from evercal.localization.answer import differ, in_base
 from evercal.localization.hypothesis import Aligned
 from evercal.localization.intrinsics import (
     CERTAINLY_OWN,
@@ -36,6 +36,34 @@ LESS_LIKELY = 1.353
 of the 90 % quantile of chi-squared with one degree of freedom."""
 ITERATIONS = 60
 """Of the variances of moving intrinsics; small ones converge slowly, to 0."""
+
+
+def localizer_of(contents: MapContents, scene: SceneMap) -> Localizer:
+    """A localizer of one scene, with the encoder of `contents`."""
+    return Localizer(contents.empty().with_scene(scene))
+
+
+def located_poses(localizer: Localizer, frames: Sequence[Frame]) -> list[SE3 | None]:
+    """Pose of each frame in the frame of the scene; None of those that are not located."""
+    poses = []
+    for frame in frames:
+        estimate = localizer.localize(frame.read_image(), frame.camera)
+        poses.append(estimate.base_from_camera)
+    return poses
+
+
+def located_as_stated(localizer: Localizer, frames: Sequence[Frame]) -> tuple[str, ...]:
+    """Names of the posed frames that are located where their poses say."""
+    [scene] = localizer.contents.scenes
+    names = []
+    for frame in frames:
+        estimate, pose = localizer.located(frame.read_image(), frame.camera)
+        assert frame.base_from_camera is not None, "a posed frame"
+        stated = scene.frame.from_base(frame.base_from_camera)
+        if estimate.status != "ok" or pose is None or differ(pose, stated):
+            continue
+        names.append(frame.name)
+    return tuple(names)
 
 
 def with_scatter(

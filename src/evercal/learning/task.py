@@ -103,7 +103,7 @@ def _keep(
     with tempfile.TemporaryDirectory(prefix="evercal-") as folder:
         root = Path(folder, "map")
         packed = Path(folder, "map.zip")
-        stored = {**report.stored(), _RESULT: _result_name(file)}
+        stored = {**report.to_dict(), _RESULT: _result_name(file)}
         MapStore(root, contents.empty()).commit(scene, stored)
         pack_map(root, packed)
         addresses.put(packed, file)

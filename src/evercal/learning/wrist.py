@@ -14,12 +14,13 @@ from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.learning.posed import learn_posed
 from evercal.learning.report import LearnReport
+from evercal.learning.stated_scatter import LEAST_ANSWERS
 from evercal.mapping.build import MapOptions
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.progress import OnProgress
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Recording
-from evercal.recordings.held_out import split_held_out
+from evercal.recordings.held_out import HeldOutSplit, split_held_out
 from evercal.robot.mount import EYE_IN_HAND
 
 STILL_SHARE = 0.3
@@ -41,12 +42,14 @@ def learn_wrist(
     """
     began = time.perf_counter()
     posed, start = _posed_by_gripper(recording, contents, on_progress)
-    split = split_held_out(posed.train)
+    split = split_held_out(posed.train, spread=True)
+    if len(split.held_out) < LEAST_ANSWERS:
+        split = HeldOutSplit(posed.train, ())
     budget = replace(budget, least=MIN_GRIPPER_FRAMES)
     options = replace(options.for_hand_eye(EYE_IN_HAND), arm=start.arm)
     learned = learn_posed(posed, split, contents, budget, options, on_progress)
     report = learned.report(contents, began)
-    hand_eye = hand_eye_of(start, learned.built, split.train, gripper_from_camera)
+    hand_eye = hand_eye_of(start, learned.built, posed.train, gripper_from_camera)
     return learned.scene, replace(report, hand_eye=hand_eye)
 
 

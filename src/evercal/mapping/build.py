@@ -382,6 +382,7 @@ def _hand_eye(
         adjustment.common,
         *by_cause,
         dict(zip(names, adjustment.errors, strict=True)),
+        dict(zip(names, adjustment.left_out, strict=True)),
         dict(zip(names, adjustment.correction, strict=True)),
         arm,
     )

@@ -156,6 +156,8 @@ class HandEyeCorrection:
     """(6, 6) covariance by errors of gripper poses that vary slowly over the recording."""
     residuals: dict[str, Array]
     """(6,) deviation of each frame's gripper pose from the images, by name; gripper frame."""
+    left_out: dict[str, Array]
+    """(7,) the same by all other gripper poses, see `Adjustment.left_out`."""
     moved: dict[str, Array]
     """(6,) the same as a motion of the camera, camera frame."""
     arm: ArmOffsets | None = None

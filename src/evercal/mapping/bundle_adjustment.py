@@ -37,6 +37,7 @@ from evercal.mapping.stated_errors import StatedErrors, Variances
 from evercal.mapping.variance_components import (
     HIDDEN,
     by_shared,
+    left_out,
     noise_of,
     pose_sigma,
     shared_variances,
@@ -340,6 +341,9 @@ class BundleAdjustment:
         prior = variances.shared[joints]
         information = np.maximum(1 / np.diag(offsets) - 1 / prior, MIN_INFORMATION)
         first_prior = self.start_variances().shared[joints]
+        errors = self.errors.at_origin(parameters)
+        rows = self.errors.of_rows(root)
+        alone = left_out(errors, rows, self.errors.noise(variances))
         return Adjustment(
             poses=self.frames.poses(parameters),
             cameras=cameras,
@@ -351,7 +355,8 @@ class BundleAdjustment:
             lens_covariance=whole,
             lens_systematic=systematic[np.ix_(with_lens, with_lens)],
             correction=self.errors.of_cameras(parameters),
-            errors=self.errors.at_origin(parameters),
+            errors=errors,
+            left_out=np.column_stack(alone),
             weight=np.minimum(variances.weight, 1.0),
             covariance=np.stack([columns.T @ columns for columns in by_pose]),
             inverse_depth=parameters.inverse_depth,

@@ -361,6 +361,9 @@ class Adjustment:
     radians."""
     errors: Array
     """(n, 6) the same where the errors of stated poses arise, see `StatedErrors`."""
+    left_out: Array
+    """(n, 7) the same by the images and all other poses alone, and the squared Mahalanobis
+    distance of which 6 is expected, in a hand-eye calibration; see `left_out`."""
     weight: Array
     """(n,) below 1 for stated poses with larger errors than most."""
     covariance: Array

@@ -219,15 +219,14 @@ class MapStore(StageStore[MapContents]):
         }
 
 
-def stored_scenes(root: Path) -> list[tuple[str, Camera, JsonObject]]:
-    """Name, adjusted camera and report of every scene of a map; the encoder is not read."""
+def stored_scenes(root: Path) -> dict[str, JsonObject]:
+    """Reports of the scenes of a map by name; the encoder is not read."""
 
-    def read(manifest: Manifest) -> list[tuple[str, Camera, JsonObject]]:
-        stored = []
+    def read(manifest: Manifest) -> dict[str, JsonObject]:
+        stored = {}
         scenes = read_scenes(root, manifest)
         for scene, stage in zip(scenes, manifest.payload["stages"], strict=True):
-            report = read_report(root / STAGES / stage)
-            stored.append((scene.name, scene.adjusted_camera, report))
+            stored[scene.name] = read_report(root / STAGES / stage)
         return stored
 
     return read_store(root, read)

@@ -14,6 +14,7 @@ from evercal.geometry import SE3
 from evercal.mapping.bundle_equations import INTRINSICS, Linearised, Parameters
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.stated_errors import StatedErrors, Variances
+from evercal.robot.pose_errors import SharedNoise
 from evercal.typing import Array
 
 _COMMON_GROUPS = (slice(0, 3), slice(3, 6))
@@ -270,3 +271,25 @@ def _linear_motions(stated: SE3, gripper_from_camera: SE3) -> Array:
     linear = np.concatenate([turns, stated.translation_m, arm], axis=1)
     basis, size, _ = np.linalg.svd(linear - linear.mean(0), full_matrices=False)
     return basis[:, size > LEAST_SINGULAR * size[0]]
+
+
+def left_out(errors: Array, rows: Array, noise: SharedNoise) -> tuple[Array, Array]:
+    """Errors (n, 6) of stated poses by the images and the other poses alone.
+
+    The posterior is divided by what each stated pose says: its own prior, given the other errors.
+
+    Args:
+        errors: (n, 6) posterior mean of the errors.
+        rows: (r, n, 6) factor of their posterior covariance, rows^T rows.
+        noise: Their prior.
+
+    Returns:
+        (n, 6) of each pose, and (n,) their squared Mahalanobis distances, of which 6 are expected.
+    """
+    pull = noise.weighted(errors[..., None])
+    posterior = noise.weighted(rows.transpose(1, 2, 0))
+    own = np.linalg.inv(noise.blocks())
+    # Of the prior's part of the posterior, as a share of the whole.
+    share = own @ posterior @ posterior.transpose(0, 2, 1)
+    error = np.linalg.solve(np.eye(6) - share, own @ pull)
+    return error[..., 0], (error * pull).sum((1, 2))

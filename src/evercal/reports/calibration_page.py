@@ -94,11 +94,13 @@ def calibration_page(
     older: NamedCalibration | None = None,
     point_m: tuple[float, float, float] | None = None,
     boards: bool = False,
+    again: str = "",
 ) -> CalibrationPage:
     """Write the report of a calibration.
 
     `store` is the path of the store whose landmarks are drawn; `boards` says whether corners of a
-    board are drawn; the report states the standard deviation of `point_m` in the camera frame.
+    board are drawn; the report states the standard deviation of `point_m` in the camera frame;
+    `again` says what differs where it was made again.
     """
     calibration = file.calibration
     missing = (*images.missing, *_missing(calibration))
@@ -144,6 +146,7 @@ def calibration_page(
         checks=check_table(calibration),
         source=source_table(file.name, calibration),
         missing=missing,
+        again=again,
     )
     return CalibrationPage(html, missing)
 
@@ -191,20 +194,17 @@ def _origin(calibration: Calibration) -> str:
 
 def _missing(calibration: Calibration) -> list[str]:
     checks = calibration.checks
-    missing = []
-    if not has_uncertainty(calibration):
-        missing.append("No uncertainty: the calibration states none.")
-    if not calibration.images:
-        missing.append("No list of images: the calibration holds none.")
-    if not calibration.error_terms:
-        missing.append("No error budget: the calibration holds none.")
-    if checks.repeatability_mm is None:
-        missing.append("No repeatability: two halves of the data were not compared.")
-    if checks.held_out_mm is None:
-        missing.append("No held-out error: no data were held out.")
-    if not calibration.camera:
-        missing.append("No intrinsics: the calibration holds none.")
-    return missing
+    halves = checks.repeatability_mm is not None
+    held_out = checks.held_out_mm is not None
+    parts = {
+        "No uncertainty: the calibration states none.": has_uncertainty(calibration),
+        "No list of images: the calibration holds none.": calibration.images,
+        "No error budget: the calibration holds none.": calibration.error_terms,
+        "No repeatability: two halves of the data were not compared.": halves,
+        "No held-out error: no data were held out.": held_out,
+        "No intrinsics: the calibration holds none.": calibration.camera,
+    }
+    return [sentence for sentence, part in parts.items() if not part]
 
 
 def camera_views(calibration: Calibration, around: Surroundings) -> Chart:

@@ -13,6 +13,8 @@ from evercal.reports.page import Table
 
 _SHOWN_ELSEWHERE = ("warnings", "left_open", "camera_sigma", "joints_move_mm")
 """Checks that stand in other parts of the page."""
+_DIGITS = {"mm": 2, "deg": 3, "m": 3, "px": 2, "s": 4}
+"""Digits of a check, by the unit at the end of its name."""
 _LONGEST_CELL = 160
 """Characters of a check in the table, at most."""
 
@@ -162,8 +164,13 @@ def check_table(calibration: Calibration) -> Table:
     rows = []
     for key, value in calibration.checks.to_dict().items():
         cell = _cell(value)
+        name, _, unit = key.rpartition("_")
+        label = key.replace("_", " ")
+        if unit in _DIGITS and isinstance(value, float):
+            label = f"{name.replace('_', ' ')} ({unit})"
+            cell = _fixed(value, _DIGITS[unit])
         if key not in _SHOWN_ELSEWHERE and len(cell) <= _LONGEST_CELL:
-            rows.append((key.replace("_", " "), cell))
+            rows.append((label, cell))
     return Table(("check", "value"), rows)
 
 
@@ -172,6 +179,8 @@ def source_table(name: str, calibration: Calibration) -> Table:
     source = {"file": name, **calibration.source, "created": calibration.created}
     stated = [(key, value) for key, value in source.items() if value]
     rows = [(key.replace("_", " "), _cell(value)) for key, value in stated]
+    if calibration.made is not None:
+        rows += [("made by", str(calibration.made)), *calibration.made.inputs.items()]
     return Table(("property", "value"), rows)
 
 

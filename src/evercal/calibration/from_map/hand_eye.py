@@ -7,18 +7,18 @@ bundle adjustment refines it together with all poses and landmarks.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
-from datetime import UTC, datetime
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 from evercal.calibration.calibration import Calibration, ErrorTerm
-from evercal.calibration.checks import LearnedChecks
+from evercal.calibration.checks import Checks
 from evercal.calibration.framed_pose import ImageUse, JointOffset
 from evercal.calibration.from_map.hand_eye_start import HandEyeStart
 from evercal.calibration.from_map.next_views import open_position
+from evercal.calibration.pose_pairs.checks import held_out_sizes
 from evercal.calibration.verdict import verdict
 from evercal.classes import frozen_arrays
 from evercal.geometry import (
@@ -38,6 +38,8 @@ from evercal.recordings.frame import Frame, stated_grippers
 from evercal.robot.arm_offsets import ArmOffsets
 from evercal.typing import JsonObject, Strings
 
+_HOW = ("pairs", "of_pairs", "start_mm", "start_deg", "given_mm", "given_deg", "advice")
+"""Fields of `HandEye` that are JSON values."""
 MOST_POSE_SIGMA_MM = 5.0
 """A larger standard deviation of gripper positions indicates such errors, too; millimetres."""
 
@@ -71,47 +73,18 @@ class HandEye:
 
     def to_dict(self) -> JsonObject:
         """Return JSON values, as `evercal learn --json` prints them."""
-        calibration = self.calibration
-        pose = calibration.parent_from_child
-        checks = calibration.checks
+        values = {name: vars(self)[name] for name in _HOW}
         return {
-            "translation_m": pose.translation_m.tolist(),
-            "quaternion_wxyz": pose.rotation_wxyz.tolist(),
-            "covariance": calibration.covariance.tolist(),
-            "pairs": self.pairs,
-            "of_pairs": self.of_pairs,
-            "start_mm": self.start_mm,
-            "start_deg": self.start_deg,
-            "mount": calibration.mount,
-            "map": calibration.source["map"],
-            "image_scatter": checks.image_scatter or [],
-            "images_located": checks.images_used or 0,
-            "given_mm": self.given_mm,
-            "given_deg": self.given_deg,
+            **self.calibration.to_dict(),
+            **values,
             "warnings": list(self.warnings),
-            "advice": self.advice,
-            "created": calibration.created,
-            "error_terms": [asdict(term) for term in calibration.error_terms],
-            "images": [asdict(image) for image in calibration.images],
-            "joints": [asdict(joint) for joint in calibration.joints],
-            "joint_covariance": calibration.joint_covariance.tolist(),
-            "joints_move_mm": checks.joints_move_mm or [],
         }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], calibration: Calibration) -> Self:
         """The inverse of `to_dict`, beside the calibration that is stored with the scene."""
-        return cls(
-            calibration,
-            values["pairs"],
-            values["of_pairs"],
-            values["start_mm"],
-            values["start_deg"],
-            values["given_mm"],
-            values["given_deg"],
-            tuple(values["warnings"]),
-            values["advice"],
-        )
+        how = {name: values[name] for name in _HOW}
+        return cls(calibration, warnings=tuple(values["warnings"]), **how)
 
 
 def hand_eye_of(
@@ -146,13 +119,13 @@ def hand_eye_of(
         },
         images=_uses(frames, built),
         error_terms=_error_terms(correction),
+        checks=_checks(correction),
         source={
             "command": "learn" if start.mount.moves else "eye-to-hand",
             "scene": built.scene.name,
             "frames": len(frames),
             "map": built.scene.digest,
         },
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
     )
     if correction.arm is not None:
         calibration = _with_joints(calibration, correction.arm, frames)
@@ -210,23 +183,31 @@ def _advice(frames: Sequence[Frame], gripper_from_camera: UncertainPose) -> str:
 
 
 def _uses(frames: Sequence[Frame], built: BuiltMap) -> tuple[ImageUse, ...]:
-    """Use of each frame; residuals are those of its gripper pose."""
+    """Use of each frame; residuals are of its gripper pose, as all others predict it."""
     assert built.hand_eye is not None, "the map was built for a hand-eye calibration"
     uses = []
     for frame in frames:
         name = frame.name
         if isinstance(frame.image, Path):
             name = str(frame.image)
-        residual = built.hand_eye.residuals.get(frame.name)
+        residual = built.hand_eye.left_out.get(frame.name)
+        reason = "not adjusted: set aside as a test of the map, or like its neighbours"
         if frame.name in built.adjusted.wrong_poses:
             reason = "its gripper pose contradicts the images"
-            uses.append(ImageUse(name, False, reason))
         elif frame.name in built.adjusted.untracked:
             reason = "it could not be tracked in other images"
-            uses.append(ImageUse(name, False, reason))
         elif residual is not None:
-            uses.append(ImageUse(name, True, "", *length_mm_deg(residual)))
+            uses.append(ImageUse(name, True, "", *length_mm_deg(residual[:6])))
+            continue
+        uses.append(ImageUse(name, False, reason))
     return tuple(uses)
+
+
+def _checks(correction: HandEyeCorrection) -> Checks:
+    """How well each gripper pose is predicted without it."""
+    rows = np.array([*correction.left_out.values()])
+    sigmas = float(np.sqrt(rows[:, 6].mean() / 6))
+    return Checks(**held_out_sizes(rows[:, :6]), held_out_sigmas=sigmas)
 
 
 def _with_joints(
@@ -236,7 +217,7 @@ def _with_joints(
         calibration,
         joints=_joint_offsets(arm),
         joint_covariance=arm.covariance,
-        checks=LearnedChecks(joints_move_mm=_moved_mm(arm, frames)),
+        checks=replace(calibration.checks, joints_move_mm=_moved_mm(arm, frames)),
     )
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from evercal.calibration.checks import LearnedChecks
 from evercal.calibration.from_map.hand_eye import HandEye
 from evercal.calibration.from_map.hand_eye_start import HandEyeStart
 from evercal.calibration.held_thing.windows import cropped, windows
@@ -69,9 +68,9 @@ def with_image_scatter(
         SE3.stack(base_from_camera), estimate.parent_from_camera.pose
     )
     scatter = deviation.T @ deviation / len(deviation)
-    checks = LearnedChecks(
+    checks = replace(
+        calibration.checks,
         images_used=len(deviation),
         image_scatter=scatter.tolist(),
-        joints_move_mm=calibration.checks.joints_move_mm,
     )
     return replace(estimate, calibration=replace(calibration, checks=checks))

@@ -27,7 +27,7 @@ from evercal.geometry import (
 )
 from evercal.recordings.poses.pairing import counted
 from evercal.storage.text_files import few
-from evercal.typing import IntArray
+from evercal.typing import Array, IntArray, JsonObject
 
 _MAX_DISTANCE_M = 20.0
 """Distance of poses from the origin above which they are not in metres."""
@@ -236,14 +236,18 @@ def held_out_error(
     rows = np.flatnonzero(fit.inliers)
     if len(rows) <= FOLDS:
         return {}
-    lengths = []
+    errors = []
     for fold in range(FOLDS):
         held_out = np.arange(len(rows)) % FOLDS == fold
         at = _refined(equation, fit, rows[~held_out])
         every, _ = predicted(equation[rows], at, fit.levels, ~held_out)
-        residual = every[held_out].reshape(-1, 2, 3)
-        lengths.append(norms(residual))
-    error = np.concatenate(lengths) * (1000.0, 180 / np.pi)
+        errors.append(every[held_out])
+    return held_out_sizes(np.concatenate(errors))
+
+
+def held_out_sizes(errors: Array) -> JsonObject:
+    """Median and root mean square lengths of errors (n, 6), metres and radians."""
+    error = norms(errors.reshape(-1, 2, 3)) * (1000.0, 180 / np.pi)
     median_mm, median_deg = np.median(error, 0).tolist()
     rms_mm, rms_deg = np.sqrt((error**2).mean(0)).tolist()
     return {

@@ -1,14 +1,13 @@
 """`PairSolution`: a fit of pose pairs, and the calibration made of it."""
 
 from dataclasses import replace
-from datetime import UTC, datetime
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.intrinsics import LENS, moved_lens
 from evercal.calibration.calibration import Calibration, ErrorTerm, ImageUse
-from evercal.calibration.checks import PairChecks
+from evercal.calibration.checks import Checks
 from evercal.calibration.pose_pairs.checks import (
     held_out_error,
     left_open,
@@ -126,8 +125,7 @@ class PairSolution:
             lenses=self._lenses(),
             images=self._images(),
             error_terms=self._error_terms(),
-            checks=PairChecks(**self._checks(time_offset_s)),
-            created=datetime.now(UTC).isoformat(timespec="seconds"),
+            checks=Checks(**self._checks(time_offset_s)),
         )
         return replace(calibration, verdict=verdict(calibration))
 

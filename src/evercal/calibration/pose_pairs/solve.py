@@ -43,6 +43,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, cross_matrix, norms, pose_distance
 from evercal.robot.mount import MountName, mount_named
 from evercal.robot.pose_errors import WANTED, ArmErrors, shared_errors
+from evercal.storage.provenance import call
 from evercal.typing import BoolArray, IntArray
 
 _USUAL = ArmErrors()
@@ -90,8 +91,9 @@ def solve(
     Returns:
         `gripper_from_camera` or `base_from_camera`.
     """
-    solution = solve_pose_pairs(pairs, mount, scale_known, corners, errors=errors)
-    return solution.calibration()
+    with call(("evercal.solve",), locals()):
+        solution = solve_pose_pairs(pairs, mount, scale_known, corners, errors=errors)
+        return solution.calibration()
 
 
 def solve_pose_pairs(

@@ -155,7 +155,7 @@ class _MapRun(_Run):
                 memory = self.stage.memory
                 size = memory.bytes or f"{100 * memory.share:g}%"
                 scene, report = learn_scene(self.scenes[number], contents, size)
-                opened.commit(scene, report.stored())
+                opened.commit(scene, report.to_dict())
             name = self.strategy.name
             named = {
                 name: Localizer(contents),
