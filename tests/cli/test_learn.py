@@ -51,7 +51,9 @@ def test_two_scenes_are_learned_and_reported(run, learned, rooms, tmp_path):
     assert report["adjusted"].keys() >= set(ADJUSTED.split())
     assert report["scene"] == "cell"
     assert report["landmarks"] > 50
-    assert [*map(len, report["set_aside"].values())] == [2, 2, 2, 2]
+    errors = report["set_aside"].values()
+    assert len(errors) == report["held_out_frames"] == 4
+    assert {*map(len, errors)} == {0, 2}  # few keyframes: some are not located
     assert report["iterations"] == report["head_bytes"] == 0
     assert report["hand_eye"] is None
     assert len(ran.err) == 1  # the line about frames; the rest is progress

@@ -12,7 +12,6 @@ from evercal.errors import InputError
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
-    from evercal.cli import parsed
 
 _MAKERS = ("calibrate", "eye-to-hand", "learn", "solve")
 """Verbs whose command is run again; a file may hold any other words."""
@@ -28,6 +27,7 @@ def made_again(file: Path, old: "Calibration") -> str:
         InputError: The file does not record a command that can be run again, or an input is gone.
     """
     from evercal.calibration.learned import calibration_at
+    from evercal.cli import parsed
     from evercal.storage.provenance import Made
 
     made = old.made

@@ -5,7 +5,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import field, fields
 from functools import partial
-from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -314,10 +313,10 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
         if other.same_base:
             yield other.agreement
     for name, error in [*report.set_aside.items()][:MOST_LINES]:
-        how = "{:.2f} mm and {:.3f} deg from its stated pose".format(
-            *error or (nan, nan)
-        )
-        yield f"  set aside    {name}: located {how}"
+        how = "not located"
+        if error:
+            how = "located {:.2f} mm, {:.3f} deg from its stated pose".format(*error)
+        yield f"  set aside    {name}: {how}"
     yield from map("warning: {}".format, report.warnings)
     found = report.hand_eye
     if found is not None:

@@ -13,7 +13,7 @@ from evercal.reports.page import Table
 
 _SHOWN_ELSEWHERE = ("warnings", "left_open", "camera_sigma", "joints_move_mm")
 """Checks that stand in other parts of the page."""
-_DIGITS = {"mm": 2, "deg": 3, "m": 3, "px": 2, "s": 4}
+_DIGITS = {"mm": 2, "deg": 3, "m": 3, "px": 2, "s": 4, "sigmas": 1}
 """Digits of a check, by the unit at the end of its name."""
 _LONGEST_CELL = 160
 """Characters of a check in the table, at most."""
