@@ -28,7 +28,8 @@ def test_it_is_the_posterior_without_what_a_pose_states(shared: bool) -> None:
     posterior = np.linalg.inv(information + noise.inverse())
     mean = posterior @ information @ best
     root = np.linalg.cholesky(posterior).T
-    errors, distance = left_out(mean.reshape(N, 6), root.reshape(-1, N, 6), noise)
+    found = left_out(mean.reshape(N, 6), root.reshape(-1, N, 6), noise)
+    errors, distance = found[:, :6], found[:, 6]
     for i in range(N):
         own = np.arange(6 * i, 6 * i + 6)
         others = np.setdiff1d(np.arange(6 * N), own)

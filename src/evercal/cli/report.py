@@ -64,13 +64,12 @@ class Report(args.Verb):
         if self.again:
             again = made_again(self.calibration, calibration)
         page = calibration_page(
-            NamedCalibration(self.calibration.name, calibration),
+            NamedCalibration(self.calibration.name, calibration, again),
             images,
             self.store and str(self.store),
             older,
             point,
             bool(boards),
-            again,
         )
         write_bytes(self.out, page.html.encode())
         best = tier(calibration)

@@ -342,8 +342,7 @@ class BundleAdjustment:
         information = np.maximum(1 / np.diag(offsets) - 1 / prior, MIN_INFORMATION)
         first_prior = self.start_variances().shared[joints]
         errors = self.errors.at_origin(parameters)
-        rows = self.errors.of_rows(root)
-        alone = left_out(errors, rows, self.errors.noise(variances))
+        noise = self.errors.noise(variances)
         return Adjustment(
             poses=self.frames.poses(parameters),
             cameras=cameras,
@@ -356,7 +355,7 @@ class BundleAdjustment:
             lens_systematic=systematic[np.ix_(with_lens, with_lens)],
             correction=self.errors.of_cameras(parameters),
             errors=errors,
-            left_out=np.column_stack(alone),
+            left_out=left_out(errors, self.errors.of_rows(root), noise),
             weight=np.minimum(variances.weight, 1.0),
             covariance=np.stack([columns.T @ columns for columns in by_pose]),
             inverse_depth=parameters.inverse_depth,

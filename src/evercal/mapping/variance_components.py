@@ -273,8 +273,8 @@ def _linear_motions(stated: SE3, gripper_from_camera: SE3) -> Array:
     return basis[:, size > LEAST_SINGULAR * size[0]]
 
 
-def left_out(errors: Array, rows: Array, noise: SharedNoise) -> tuple[Array, Array]:
-    """Errors (n, 6) of stated poses by the images and the other poses alone.
+def left_out(errors: Array, rows: Array, noise: SharedNoise) -> Array:
+    """Errors (n, 7) of stated poses by the images and the other poses alone.
 
     The posterior is divided by what each stated pose says: its own prior, given the other errors.
 
@@ -284,7 +284,7 @@ def left_out(errors: Array, rows: Array, noise: SharedNoise) -> tuple[Array, Arr
         noise: Their prior.
 
     Returns:
-        (n, 6) of each pose, and (n,) their squared Mahalanobis distances, of which 6 are expected.
+        (n, 7) of each pose, last its squared Mahalanobis distance, of which 6 is expected.
     """
     pull = noise.weighted(errors[..., None])
     posterior = noise.weighted(rows.transpose(1, 2, 0))
@@ -292,4 +292,4 @@ def left_out(errors: Array, rows: Array, noise: SharedNoise) -> tuple[Array, Arr
     # Of the prior's part of the posterior, as a share of the whole.
     share = own @ posterior @ posterior.transpose(0, 2, 1)
     error = np.linalg.solve(np.eye(6) - share, own @ pull)
-    return error[..., 0], (error * pull).sum((1, 2))
+    return np.column_stack([error[..., 0], (error * pull).sum((1, 2))])

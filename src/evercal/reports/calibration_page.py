@@ -50,6 +50,8 @@ class NamedCalibration(NamedTuple):
 
     name: str
     calibration: Calibration
+    again: str = ""
+    """What differs where it was made again."""
 
 
 class CalibrationPage(NamedTuple):
@@ -94,13 +96,11 @@ def calibration_page(
     older: NamedCalibration | None = None,
     point_m: tuple[float, float, float] | None = None,
     boards: bool = False,
-    again: str = "",
 ) -> CalibrationPage:
     """Write the report of a calibration.
 
     `store` is the path of the store whose landmarks are drawn; `boards` says whether corners of a
-    board are drawn; the report states the standard deviation of `point_m` in the camera frame;
-    `again` says what differs where it was made again.
+    board are drawn; the report states the standard deviation of `point_m` in the camera frame.
     """
     calibration = file.calibration
     missing = (*images.missing, *_missing(calibration))
@@ -144,9 +144,8 @@ def calibration_page(
         residuals=residual_chart(calibration),
         uses=use_table(calibration),
         checks=check_table(calibration),
-        source=source_table(file.name, calibration),
+        source=source_table(file.name, calibration, file.again),
         missing=missing,
-        again=again,
     )
     return CalibrationPage(html, missing)
 

@@ -174,9 +174,10 @@ def check_table(calibration: Calibration) -> Table:
     return Table(("check", "value"), rows)
 
 
-def source_table(name: str, calibration: Calibration) -> Table:
-    """What the calibration was made from."""
+def source_table(name: str, calibration: Calibration, again: str) -> Table:
+    """What the calibration was made from, and what differs where it was made again."""
     source = {"file": name, **calibration.source, "created": calibration.created}
+    source["again"] = again
     stated = [(key, value) for key, value in source.items() if value]
     rows = [(key.replace("_", " "), _cell(value)) for key, value in stated]
     if calibration.made is not None:
