@@ -63,7 +63,7 @@ class Learn(args.Verb):
     Example: evercal learn cell.evercal wrist_recording/ --calibration wrist.json
     """
 
-    writes = ("store", "calibration", "results", "ray")
+    writes = ("store", "calibration", "results", "ray", "replace")
     store: args.Store
     recordings: Annotated[Positional[tuple[str, ...]], args.shown("RECORDING...")] = ()
     """Folders of recordings, files of bags, or addresses such as s3://bucket/folder."""
