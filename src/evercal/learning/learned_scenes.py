@@ -138,8 +138,7 @@ class LearnedScenes:
             )
 
         with call(("Map.learn",), given):
-            in_map = (base, replace)
-            return self._add(recording, name, learned, on_progress, in_map)
+            return self._add(recording, name, learned, on_progress, (base, replace))
 
     def eye_to_hand(
         self,
