@@ -4,12 +4,14 @@ import re
 import shutil
 from pathlib import Path
 
-KEYS = "name train_frames memory_bytes keyframes camera landmarks adjusted hand_eye"
+KEYS = "name train_frames memory_bytes keyframes camera landmarks adjusted hand_eye made"
 
 
 def test_info_of_a_map(run, store):
     info = run.json("info", store)
     assert info["strategy"] == "evercal"
+    for scene in info["scenes"]:
+        assert scene["made"]["command"][:2] == ["evercal", "learn"]
     files = filter(Path.is_file, store.rglob("*"))
     assert info["total_bytes"] == sum(file.stat().st_size for file in files)
     assert 0 < info["memory_bytes"] < info["total_bytes"]

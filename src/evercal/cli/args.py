@@ -87,7 +87,7 @@ Device = Annotated[
 class Verb:
     """A verb with its arguments."""
 
-    writes: ClassVar[Strings] = ()
+    writes: ClassVar[tuple[str, ...]] = ()
     """Arguments that name what a verb writes, where it keeps what made it; the result first."""
     json: bool = False
     """Print one JSON object."""

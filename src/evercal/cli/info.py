@@ -8,7 +8,6 @@ from typing import Any
 from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import length, size, table
-from evercal.storage.provenance import Made
 
 MEMORY_FILES = ("keyframes.safetensors", "state.safetensors")
 """Files of the keyframes: of a scene of a map, and of a store of networks."""
@@ -28,6 +27,8 @@ class Info(args.Verb):
     def run(self) -> int:
         if self.check:
             return self._check()
+        from evercal.storage.provenance import Made
+
         strategy = args.strategy_of(self.store)
         if strategy in (args.MAP, None):
             scenes, short_side, heads, sizes = _map(self.store)

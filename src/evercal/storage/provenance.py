@@ -51,16 +51,24 @@ class Made:
         inputs = {}
         for name, value in arguments.items():
             inputs |= _inputs(name, value)
-        words = tuple(map(_shown, command))
-        return cls(version("evercal"), words, inputs, now())
+        return cls(
+            version("evercal"),
+            tuple(map(_shown, command)),
+            inputs,
+            now(),
+        )
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any] | None) -> Self | None:
         """The inverse of `asdict`; None of files without a record."""
         if not data:
             return None
-        words = tuple(map(str, data["command"]))
-        return cls(data["version"], words, dict(data["inputs"]), data["date"])
+        return cls(
+            data["version"],
+            tuple(map(str, data["command"])),
+            dict(data["inputs"]),
+            data["date"],
+        )
 
     def __str__(self) -> str:
         return f"evercal {self.version}, {self.date}: {command_line(self.command)}"
