@@ -4,7 +4,9 @@ import re
 import shutil
 from pathlib import Path
 
-KEYS = "name train_frames memory_bytes keyframes camera landmarks adjusted hand_eye made"
+KEYS = (
+    "name train_frames memory_bytes keyframes camera landmarks adjusted hand_eye made"
+)
 
 
 def test_info_of_a_map(run, store):
