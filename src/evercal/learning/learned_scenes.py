@@ -223,8 +223,7 @@ class LearnedScenes:
         scene, same_place = placed(replace(scene, base=base or ""), kept)
         size = kept.with_scene(scene).memory_bytes
         report = replace(report, memory_bytes=size, same_place=same_place)
-        made = {**report.to_dict(), **recorded()}
-        self._store.commit(scene, made, replaced)
+        self._store.commit(scene, {**report.to_dict(), **recorded()}, replaced)
         self._changed()
         return report
 
