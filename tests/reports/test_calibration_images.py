@@ -167,9 +167,7 @@ def test_residuals_refer_to_the_calibration_of_a_fixed_camera(
     tmp_path: Path, mount: str, median_px: float
 ) -> None:
     write_images(tmp_path, "a.png")
-    own = calibration(
-        {"a.png": True}, mount=mount, frames=FrameNames("table", "hand")
-    )
+    own = calibration({"a.png": True}, mount=mount, frames=FrameNames("table", "hand"))
     localizer: Any = FixedLocalizer(BASE_FROM_CAMERA @ SE3.exp([0.05, 0, 0, 0, 0, 0]))
     [image] = drawn_in(own, tmp_path, localizer)
     assert image.landmarks == 2
