@@ -5,12 +5,13 @@ with the noise of their corners, depths with an error of scale. A calibration st
 good one errs by it. A bad one errs by 0.3 to 10 mm and 0.02 to 1 deg more.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.rows import Row, save
+from benchmarks.rows import Row, once, save
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.evidence import Data, plus
 from evercal.calibration.picked_points import PickedPoint
@@ -34,6 +35,8 @@ DEPTH_SCALE = 1.01
 """Measured over true depth."""
 TOOL_M = np.array([0.01, -0.02, 0.12])
 """Tip of the tool in the gripper."""
+TILTS = np.array([[0.5, 0, 0], [0, 0.5, 0], [-0.4, -0.4, 0]])
+"""Orientations in which the first point is touched again, radians."""
 BOARD_M = np.stack(np.meshgrid(*2 * [np.linspace(-0.1, 0.1, 6)], [0.0]), -1).reshape(
     -1, 3
 )
@@ -52,10 +55,10 @@ class Case(NamedTuple):
 
 
 CASES = [
-    *(Case("points", n, moves) for moves in (False, True) for n in (1, 2, 3, 5, 8)),
+    *(Case("points", n, moves) for moves in (False, True) for n in (1, 3, 5, 8)),
     *(Case("points, depth", n, False) for n in (1, 3)),
-    *(Case("points, tool unknown", n, False) for n in (3, 5)),
-    *(Case("board", n, moves) for moves in (False, True) for n in (2, 3, 4, 6)),
+    *(Case("points, tool unknown", n, False) for n in (3,)),
+    *(Case("board", n, moves) for moves in (False, True) for n in (2, 4, 6)),
     Case("board, known place", 1, False),
 ]
 
@@ -78,9 +81,12 @@ def run(out: Path = Path("runs/verify"), draws: int = 200) -> None:
     """
     rows = []
     for case in CASES:
-        found = [_tried(case, seed) for seed in range(FIRST_SEED, FIRST_SEED + draws)]
-        rows.append({**case._asdict(), **_summary(np.array(found))})
-        print(rows[-1], flush=True)
+        seeds = range(FIRST_SEED, FIRST_SEED + draws)
+        row = once(
+            out / f"{case.kind}-{case.count}-{case.moves}.json",
+            lambda c=case, s=seeds: _summary(c, [_tried(c, seed) for seed in s]),
+        )
+        rows.append(row)
     save(out / "verify.csv", rows, {"draws": draws})
 
 
@@ -149,7 +155,8 @@ def _points(case: Case, trial: Trial) -> Data:
     if "tool" in case.kind:
         touched += [f"{names[0]}#{i}" for i in (2, 3, 4)]
     turns = np.zeros((len(touched), 6))
-    turns[:, 3:] = rng.uniform(-0.5, 0.5, (len(touched), 3))
+    turns[:, 3:] = rng.uniform(-0.2, 0.2, (len(touched), 3))
+    turns[case.count :, 3:] += TILTS[: len(touched) - case.count]
     rotated = down @ SE3.exp(turns)
     tips = np.r_[points, np.repeat(points[:1], len(touched) - len(names), 0)]
     tips = tips + rng.normal(0, TOUCH_M, tips.shape)
@@ -207,21 +214,25 @@ def _board(case: Case, trial: Trial) -> Data:
     return target_data(trial.calibration, views, named, known)
 
 
-def _summary(found: np.ndarray) -> Row:
-    bad, verdict, true, measured, most, stated = found.T
+def _summary(case: Case, found: Sequence[tuple[float, ...]]) -> Row:
+    bad, verdict, true, measured, most, stated = np.transpose(found)
     good = bad == 0
-    times = true / stated
     accused = verdict == 2
+    times = true / stated
     clear = (bad == 1) & (times > BAD)
     far = (bad == 1) & (times > 2 * BAD)
     factor = np.quantile(np.abs(np.log(measured / true)), 0.9)
     return {
-        "accused of good %": round(100 * accused[good].mean(), 1),
-        "no answer of good %": round(100 * (verdict[good] == 1).mean()),
-        f"caught above {BAD:g} %": round(100 * accused[clear].mean()),
-        f"caught above {2 * BAD:g} %": round(100 * accused[far].mean()),
-        f"honest above {BAD:g} %": round(100 * (verdict[clear] == 0).mean()),
-        "factor 90 %": round(float(np.exp(factor)), 2),
-        "below 95 % error %": round(100 * (true < most).mean()),
+        "data": case.kind,
+        "number": case.count,
+        "camera": "gripper" if case.moves else "fixed",
+        "good, accused %": float(100 * accused[good].mean()),
+        "good, no answer %": float(100 * (verdict[good] == 1).mean()),
+        f"above {BAD:g}x, caught %": float(100 * accused[clear].mean()),
+        f"above {BAD:g}x, honest %": float(100 * (verdict[clear] == 0).mean()),
+        f"above {2 * BAD:g}x, caught %": float(100 * accused[far].mean()),
+        "factor at 90 %": float(np.exp(factor)),
+        "below 95 % error %": float(100 * (true < most).mean()),
+        "good": int(good.sum()),
         "bad": int(clear.sum()),
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from evercal.calibration.calibration import read_calibration
+from evercal.cli.args import next_words
 from evercal.errors import with_options
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings import write_image
@@ -42,8 +44,12 @@ def test_folder_of_images_is_calibrated_and_checked(
     assert first.startswith("base_from_camera: the pose of camera in base")
     assert first.endswith("; scene hall")
     assert "4 of 4 used" in ran.out
-    export = f"next: evercal export {out} --format easy_handeye2 --parent BASE --child CAMERA"
-    assert ran.out.splitlines()[-1] == f"{export} --robot-frame GRIPPER"
+    assert ran.out.splitlines()[-1].startswith(
+        f"next: evercal verify {out} IMAGE... --pick"
+    )
+    tested = replace(read_calibration(out), verifications=({},))
+    words = "--parent BASE --child CAMERA --robot-frame GRIPPER"
+    assert next_words(tested, out)[4:] == words.split()
     estimate = read_calibration(out)
     assert pose_distance(estimate.parent_from_child, truth_of(hall.test[3]))[0] < 0.004
     assert estimate.source["store"] == str(hall_store)
@@ -65,7 +71,8 @@ def test_frames_of_a_calibration_are_named(run, hall_store, four_images, tmp_pat
     assert read_calibration(tmp_path / "c.json").frames == FrameNames(
         "base_link", camera="optical"
     )
-    assert ran.out.splitlines()[-1].endswith("easy_handeye2 --robot-frame GRIPPER")
+    tested = replace(read_calibration(tmp_path / "c.json"), verifications=({},))
+    assert next_words(tested, "c.json")[-2:] == ["--robot-frame", "GRIPPER"]
     launch = tmp_path / "c.launch.py"
     export = ("export", tmp_path / "c.json", "--format launch_py --out", launch)
     assert run(*export).code == 0

@@ -39,7 +39,7 @@ def test_report_is_one_self_contained_file(run, calibration, tmp_path):
     assert ran.code == 0
     assert "Good for precision assembly" in ran.out
     assert "No held-out error" in ran.out
-    assert ran.out.splitlines()[-1].startswith("next: evercal export ")
+    assert ran.out.splitlines()[-1].startswith("next: evercal verify ")
     page = (tmp_path / "r.html").read_text()
     # The image; the camera with its ellipsoid, and the residuals.
     assert page.count('src="data:image/') == 1

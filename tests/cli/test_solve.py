@@ -43,7 +43,7 @@ def test_a_calibration_is_written_and_printed(run, tmp_path):
     assert ran.out.startswith("gripper_from_camera: the pose of camera in gripper")
     assert "23 of 25 used" in ran.out
     assert f"rejected   row {simulated.spoiled[0] + 1}: " in ran.out
-    assert ran.out.splitlines()[-1].startswith("next: evercal export")
+    assert ran.out.splitlines()[-1].startswith("next: evercal verify")
     calibration = read_calibration(tmp_path / "out.json")
     difference = error(calibration.parent_from_child, simulated.parent_from_camera)
     assert np.linalg.norm(difference[:3]) < 0.001

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import threading
+import urllib.request
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.calibration.evidence import plus
 from evercal.geometry import SE3, Camera
 from evercal.recordings import write_image
+from evercal.service.picking import PickServer
 from evercal.simulation.box_room import look_at
 
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
@@ -49,6 +52,7 @@ def test_touched_points(run, folder: Path) -> None:
     assert "5 touched points: within" in right.out
     assert ": honest" in right.out
     assert "p4 in a.png" in right.out
+    assert right.out.splitlines()[-1].startswith("next: evercal export tripod.json")
     wrong = run("verify moved.json", TOUCHED)
     assert wrong.code == 1
     assert "not as stated" in wrong.out
@@ -61,6 +65,41 @@ def test_the_file_keeps_the_result(run, folder: Path) -> None:
     before, after = read_calibration("tripod.json").verifications
     assert before == first
     assert after["created"] >= before["created"]
+
+
+def test_the_report_shows_the_result(run, folder: Path) -> None:
+    run("verify moved.json", TOUCHED)
+    run("report moved.json --out r.html")
+    page = Path("r.html").read_text("utf-8")
+    assert "Tests by other data" in page
+    assert "5 touched points: errors of" in page
+    assert "<strong>not as stated</strong>" in page
+
+
+def test_points_are_picked_in_the_browser(run, folder: Path) -> None:
+    rows = [line.split(",") for line in Path("picks.csv").read_text().splitlines()[1:]]
+    body = json.dumps([[image, name, float(u), float(v)] for image, name, u, v in rows])
+    Path("picks.csv").unlink()
+    opened = []
+    start = PickServer.wait
+
+    def wait(server: PickServer) -> None:
+        opened.append(server.points)
+        thread = threading.Thread(target=post, args=(server.url,))
+        thread.start()
+        start(server)
+        thread.join()
+
+    def post(url: str) -> None:
+        urllib.request.urlopen(f"{url}picks", body.encode(), 10).close()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PickServer, "wait", wait)
+        ran = run("verify tripod.json a.png --pick", TOUCHED)
+    assert opened == [[f"p{i}" for i in range(5)]]
+    assert ran.code == 0
+    assert "pick the points at http://127.0.0.1:" in ran.out
+    assert ": honest" in ran.out
 
 
 def test_gripper_poses_and_a_stated_tool(run, folder: Path) -> None:

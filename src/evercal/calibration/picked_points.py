@@ -1,5 +1,8 @@
 """Tables of touched points, and of points that were picked in images."""
 
+import csv
+import io
+from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -7,6 +10,7 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.recordings.poses.row_files import is_number, table_cells
+from evercal.storage import write_bytes
 from evercal.storage.text_files import named_errors, read_text, refuse_repeated
 from evercal.typing import Array
 
@@ -43,6 +47,27 @@ def read_picks(path: Path) -> list[PickedPoint]:
         labels = [f"{name} in {image}" for (image, name), _ in rows]
         refuse_repeated(labels, "pick a point once in an image")
     return [PickedPoint(image, name, pixel) for (image, name), pixel in rows]
+
+
+def write_picks(path: Path, rows: object, images: Collection[str]) -> int:
+    """Write rows of image, name, u, v that a page has sent, and return their number.
+
+    Raises:
+        ValueError: They are no picks in these images.
+    """
+    if not isinstance(rows, list) or not rows:
+        raise ValueError("pick a point first")
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(PICKS.split(", "))
+    for row in rows:
+        image, name, u, v = row
+        known = image in images and isinstance(name, str) and name.strip()
+        if not known or not name.isprintable() or not np.isfinite([u, v]).all():
+            raise ValueError("not all are named picks in these images")
+        table.writerow([image, name, f"{float(u):.2f}", f"{float(v):.2f}"])
+    write_bytes(path, text.getvalue().encode())
+    return len(rows)
 
 
 def _rows(path: Path, names: int, columns: str) -> list[tuple[list[str], Array]]:

@@ -73,7 +73,7 @@ def verdict(calibration: Calibration) -> str:
 
 def _advice(use: Tier | None) -> str:
     if use is TIERS[0]:
-        return "Check it on the robot before use: touch a point that the camera sees."
+        return "Check it on the robot before use, with points that it touches: 'evercal verify'."
     wanted = TIERS[-1]
     if use is not None:
         wanted = TIERS[TIERS.index(use) - 1]

@@ -223,10 +223,16 @@ class ArmGiven:
 WhichArm = Annotated[ArmGiven, arg(name="")]
 
 
-def export_words(calibration: "Calibration", file: object) -> list[object]:
-    """The words of an export of a calibration file to ROS, with options for unknown names."""
+def next_words(calibration: "Calibration", file: object) -> list[object]:
+    """The words of a test of a calibration file; after one, of its export to ROS.
+
+    The export has options for unknown names.
+    """
     from evercal.calibration.export.request import unknown_frames
 
+    if not calibration.verifications:
+        points = ("--points", "FILE", "--picks", "FILE")
+        return ["verify", file, "IMAGE...", "--pick", *points]
     words: list[object] = ["export", file, "--format", "easy_handeye2"]
     for name, role in unknown_frames(calibration).items():
         words += [option(name), role.upper()]

@@ -70,7 +70,7 @@ class Calibrate(args.Verb):
         self.answer(
             {**calibration.to_dict(), **at_record(calibration, point)},
             *calibration_lines(calibration, point),
-            then=args.export_words(calibration, self.out),
+            then=args.next_words(calibration, self.out),
         )
         return 0 if tier(calibration) else 1
 

@@ -56,6 +56,6 @@ class EyeToHand(args.Verb):
             {**calibration.to_dict(), **at_record(calibration, point)},
             *calibration_lines(calibration, point),
             *joint_lines(calibration.joints, self.out),
-            then=args.export_words(calibration, self.out),
+            then=args.next_words(calibration, self.out),
         )
         return 0 if tier(calibration) else 1

@@ -222,7 +222,7 @@ class Learn(args.Verb):
     ) -> Sequence[object]:
         if report.hand_eye is not None:
             file = self.calibration or self.store
-            return args.export_words(report.hand_eye.calibration, file)
+            return args.next_words(report.hand_eye.calibration, file)
         if not recording.metric:
             images = ("IMAGE...", "--robot-poses", "FILE")
             return "align", self.store, report.scene, *images

@@ -97,7 +97,7 @@ class Report(args.Verb):
         if again:
             lines.append(f"  {again}")
         lines += map("  {}".format, page.missing)
-        then = args.export_words(calibration, self.calibration)
+        then = args.next_words(calibration, self.calibration)
         self.answer(record, *lines, f"wrote {self.out}", then=then)
         return 0
 

@@ -61,7 +61,7 @@ class Solve(args.Verb):
         calibration = self._with_image_paths(solved)
         calibration.write(self.out)
         lines = (*calibration_lines(calibration), *_check_lines(calibration))
-        then = args.export_words(calibration, self.out)
+        then = args.next_words(calibration, self.out)
         self.answer(calibration.to_dict(), *lines, then=then)
         return 0 if tier(calibration) else 1
 

@@ -8,7 +8,7 @@ from tyro.conf import Positional, arg
 
 from evercal.classes import frozen
 from evercal.cli import args
-from evercal.cli.console import say_notes
+from evercal.cli.console import require_writable, say_notes
 from evercal.errors import InputError
 from evercal.progress import progress_bar
 
@@ -55,6 +55,8 @@ class Verify(args.Verb):
     picks: args.File = None
     """Touched points in images: lines of image, name, u, v in pixels; images relative to this
     file."""
+    pick: bool = False
+    """Pick the points in the images, on a page in the browser that writes the file of picks."""
     points: args.File = None
     """Touched points: lines of name, x, y, z of the tool's tip in the base frame, metres."""
     touches: args.File = None
@@ -84,8 +86,10 @@ class Verify(args.Verb):
         camera = calibration.camera
         lines = []
         if self.picks is not None:
-            picks, grippers = self._picked(calibration, self.picks)
             touches = self._touches()
+            if self.pick:
+                self._pick(touches, self.picks)
+            picks, grippers = self._picked(calibration, self.picks)
             data = touched_data(calibration, touches, picks, grippers, self.pick_px)
         else:
             target, grippers = self._target(calibration)
@@ -97,16 +101,21 @@ class Verify(args.Verb):
         if self.which != args.ArmGiven():
             errors = self.which.errors()
         found = calibration.verify(data, errors)
+        known = (*calibration.verifications, found.to_dict())
+        calibration = replace(calibration, verifications=known)
         if self.calibration.is_file():
-            known = (*calibration.verifications, found.to_dict())
-            replace(calibration, verifications=known).write(self.calibration)
+            calibration.write(self.calibration)
         for name, miss_m in found.misses_m.items():
             lines.append(f"  {1000 * miss_m:8.2f} mm  {name}")
         if not found.agrees:
             for name, share in found.causes.items():
                 lines.append(f"  cause        {name}: {100 * share:.0f} %")
         lines.insert(0, _LINES.format(found))
-        self.answer(found.to_dict(), *lines, *filter(None, [found.advice]))
+        then = ()
+        if found.agrees:
+            then = args.next_words(calibration, self.calibration)
+        lines += filter(None, [found.advice])
+        self.answer(found.to_dict(), *lines, then=then)
         return 0 if found.agrees else 1
 
     def _touches(self) -> "Touches":
@@ -126,6 +135,15 @@ class Verify(args.Verb):
             raise InputError(f"{self.touches}: add a column name of the touched points")
         tool = args.Point.parse(self.tool, "--tool")
         return Touches(rows.names, rows.poses, tool and np.array(tool), sigma_m)
+
+    def _pick(self, touches: "Touches", out: Path) -> None:
+        from evercal.recordings.image_files import image_files
+        from evercal.service.picking import PickServer
+
+        require_writable(out, "--picks")
+        with PickServer(image_files(self.images), touches.points, out) as server:
+            print(f"pick the points at {server.url}", file=self.log, flush=True)
+            server.wait()
 
     def _grippers(self, images: "dict[str, Path]") -> "dict[str, SE3]":
         from evercal.recordings.poses.pairing import poses_of_images

@@ -1,7 +1,9 @@
 """Who may reach a service or a page: addresses to listen on, and requests of a browser."""
 
+import hmac
 import ipaddress
 import socket
+from typing import Any
 from urllib.parse import urlsplit
 
 from evercal.errors import InputError
@@ -35,6 +37,22 @@ def foreign(host: str, origin: str | None, local: bool) -> str | None:
     if origin is not None and origin.partition("://")[2].lower() != host.lower():
         return "requests of other web pages are refused"
     return None
+
+
+def refusal(path: str, headers: Any, key: str, local: bool) -> str | None:
+    """Why a page's request, or the handshake of its connection, is refused; None if it is not.
+
+    `headers` are those of the standard library or of websockets.
+    """
+    stated = f"{path}/".split("/")[1].partition("?")[0]
+    stated = stated.encode("utf-8", "surrogateescape")
+    if not hmac.compare_digest(stated, key.encode()):
+        return "open the address that evercal printed, with its key"
+    hosts = headers.get_all("Host") or []
+    origins = headers.get_all("Origin") or []
+    if len(hosts) != 1 or len(origins) > 1:
+        return "one Host and at most one Origin are needed"
+    return foreign(hosts[0], next(iter(origins), None), local)
 
 
 def listening_socket(host: str, port: int) -> socket.socket:

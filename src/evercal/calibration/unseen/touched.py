@@ -43,9 +43,14 @@ class Touches:
     sigma_m: float = TOUCH_M
     """Standard deviation per axis between tip and point."""
 
+    @property
+    def points(self) -> list[str]:
+        """(k,) names of the touched points."""
+        return [name.partition("#")[0] for name in self.names]
+
     def positions(self, base_from_gripper: SE3, tool_error: Array) -> dict[str, Array]:
         """Points (3,) by name, by gripper poses (k,) and an error (3,) of a stated tool."""
-        touched = [name.partition("#")[0] for name in self.names]
+        touched = self.points
         same = np.array(touched)[:, None] == touched
         mean = same / same.sum(1)
         if self.tool_m is not None:

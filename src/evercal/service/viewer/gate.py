@@ -4,7 +4,6 @@ viser checks neither where a request comes from nor who sends it, and has no set
 the function that opens its server is replaced while it starts.
 """
 
-import hmac
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
@@ -15,20 +14,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from evercal.errors import InputError
-from evercal.service.hosts import foreign
-
-
-def refusal(request: Request, key: str, local: bool) -> str | None:
-    """Why a page's request, or the handshake of its connection, is refused; None if it is not."""
-    stated = f"{request.path}/".split("/")[1].partition("?")[0]
-    stated = stated.encode("utf-8", "surrogateescape")
-    if not hmac.compare_digest(stated, key.encode()):
-        return "open the address that evercal printed, with its key"
-    hosts = request.headers.get_all("Host")
-    origins = request.headers.get_all("Origin")
-    if len(hosts) != 1 or len(origins) > 1:
-        return "one Host and at most one Origin are needed"
-    return foreign(hosts[0], next(iter(origins), None), local)
+from evercal.service.hosts import refusal
 
 
 @contextmanager
@@ -46,7 +32,7 @@ def gated(key: str, local: bool) -> Iterator[None]:
         handler: Any, *address: Any, process_request: Any, **options: Any
     ) -> Any:
         def process(connection: ServerConnection, request: Request) -> Response | None:
-            if reason := refusal(request, key, local):
+            if reason := refusal(request.path, request.headers, key, local):
                 return connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
             path = request.path.removeprefix(f"/{key}")
             return process_request(connection, Request(path or "/", request.headers))
