@@ -6,6 +6,7 @@ import secrets
 from collections.abc import Sequence
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from typing import Any
 
 from evercal.bounds import RequestBounds
 from evercal.calibration.picked_points import write_picks
@@ -51,21 +52,22 @@ class PickServer(HTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: PickServer
+    server: Any
     timeout = RequestBounds().wait_s
 
     def do_GET(self) -> None:
         """Answer with the page or an image."""
         server = self.server
         path = self._path()
+        files = {f"image/{i}": file for i, file in enumerate(server.images)}
         if path == "":
             given = {"images": server.names, "points": server.points, "picks": []}
             text = json.dumps(given).replace("<", "\\u003c")
             page = _PAGE.read_text("utf-8").replace("GIVEN", text, 1)
             self._answer(200, page.encode(), "text/html; charset=utf-8")
-        elif path in map("image/{}".format, range(len(server.images))):
-            image = read_image(server.images[int(path.removeprefix("image/"))])
-            self._answer(200, encode_jpeg(image, quality=95), "image/jpeg")
+        elif path in files:
+            image = encode_jpeg(read_image(files[path]), quality=95)
+            self._answer(200, image, "image/jpeg")
         elif path is not None:
             self._answer(404, b"not found")
 
