@@ -52,6 +52,19 @@ def test_inputs_are_files_by_their_ending_and_values(folder) -> None:
     assert inputs["rec/*.jpg"].startswith("files: 2, sha256: ")
 
 
+def test_images_of_a_folder_are_those_in_it_and_a_map_is_its_manifest(folder) -> None:
+    Path("rec/more").mkdir()
+    Path("rec/more/c.jpg").write_text("c")
+    Path("map").mkdir()
+    Path("map/manifest.json").write_text("{}")
+    Path("map/other.json").write_text("{}")
+    given = {"images": Path("rec"), "recording": "rec", "store": Path("map")}
+    inputs = [Made.of((), {name: value}).inputs for name, value in given.items()]
+    assert inputs[0]["rec/*.jpg"].startswith("files: 2, ")
+    assert inputs[1]["rec/*.jpg"].startswith("files: 3, ")
+    assert set(inputs[2]) == {"map/manifest.json"}
+
+
 def test_a_record_names_neither_users_nor_passwords(folder) -> None:
     words = ("evercal", "learn", f"{folder}/anna/m", "s3://me:secret@host/x?key=1")
     made = Made.of(words, {"camera": folder / "anna/x.json"})

@@ -164,10 +164,10 @@ def check_table(calibration: Calibration) -> Table:
     rows = []
     for key, value in calibration.checks.to_dict().items():
         cell = _cell(value)
-        name, _, unit = key.rpartition("_")
+        unit = key.rpartition("_")[2]
         label = key.replace("_", " ")
         if unit in _DIGITS and isinstance(value, float):
-            label = f"{name.replace('_', ' ')} ({unit})"
+            label = f"{label.removesuffix(unit)}({unit})"
             cell = _fixed(value, _DIGITS[unit])
         if key not in _SHOWN_ELSEWHERE and len(cell) <= _LONGEST_CELL:
             rows.append((label, cell))

@@ -124,7 +124,8 @@ def _inputs(name: str, value: Any) -> dict[str, str]:
         store = path / MANIFEST
         if store.exists():  # it has the checksums of all files
             path = store
-        for file in [path, *sorted(path.rglob("[!.]*"))]:
+        files = path.glob if name == "images" else path.rglob
+        for file in [path, *sorted(files("[!.]*"))]:
             group = path / f"*{file.suffix}" if file != path else path
             if file.is_file():
                 groups.setdefault(_shown(str(group)), []).append(file)
