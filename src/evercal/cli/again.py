@@ -13,7 +13,7 @@ from evercal.errors import InputError
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
 
-_MAKERS = ("calibrate", "eye-to-hand", "learn", "solve")
+_MAKERS = {"calibrate", "eye-to-hand", "learn", "solve"}
 """Verbs whose command is run again; a file may hold any other words."""
 
 
@@ -32,7 +32,7 @@ def made_again(file: Path, old: "Calibration") -> str:
 
     made = old.made
     verb: Any = None
-    if made is not None and {*made.command[1:2]} & {*_MAKERS}:
+    if made is not None and _MAKERS & {*made.command[1:2]}:
         verb = parsed([*map(os.path.expanduser, made.command[1:])])
     if made is None or not hasattr(verb, "writes"):
         raise InputError(
