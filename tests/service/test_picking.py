@@ -34,13 +34,17 @@ def server(tmp_path: Path) -> Iterator[PickServer]:
 
 
 def ask(
-    server: PickServer, method: str, path: str, body: bytes = b"", **headers: str
+    server: PickServer,
+    method: str,
+    path: str,
+    body: bytes = b"",
+    headers: dict[str, str] | None = None,
 ) -> tuple[int, bytes]:
     """Status and content of an answer; the path is below the key unless it begins with `//`."""
     key = "" if path.startswith("//") else f"/{server.key}"
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
     try:
-        connection.request(method, key + path, body, headers)
+        connection.request(method, key + path, body, headers or {})
         answer = connection.getresponse()
         return answer.status, answer.read()
     except OSError:
@@ -76,8 +80,8 @@ def test_others_are_refused(server: PickServer) -> None:
     assert ask(server, "GET", "//image/0")[0] == 403
     assert ask(server, "POST", "//picks", b"[]")[0] == 403
     for headers in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
-        assert ask(server, "GET", "/", **headers)[0] == 403
-        assert ask(server, "POST", "/picks", b"[]", **headers)[0] == 403
+        assert ask(server, "GET", "/", headers=headers)[0] == 403
+        assert ask(server, "POST", "/picks", b"[]", headers)[0] == 403
     assert not server.out.exists()
 
 
