@@ -159,7 +159,7 @@ class Localizer:
         first, *others = options.attempts
         best = self._tried(query, first)
         # A pose that is barely accepted may be beaten in the next attempt.
-        if accepted(best, options.immediate):
+        if accepted(best, options.immediate) or not others:
             return best
         if self._inliers(best) == "few inliers":  # rotated, or of another room
             query = replace(query, encoded=matcher.upright(query))
