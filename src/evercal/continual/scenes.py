@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,7 +16,7 @@ from evercal.continual.networks.descriptor import Descriptor
 from evercal.continual.networks.device import device_of_network
 from evercal.continual.networks.head import Head
 from evercal.features.encoder import Encoder
-from evercal.geometry import Camera
+from evercal.geometry import Camera, spread
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import MapFrame
 
@@ -156,6 +155,5 @@ def corrected_camera(camera: Camera, correction: Tensor) -> Camera:
 
 def prototypes(descriptors: Tensor) -> Tensor:
     """At most 256 of (n, width) descriptors, spread over a recording; half precision, CPU."""
-    count = min(MAX_PROTOTYPES, len(descriptors))
-    index = np.linspace(0, len(descriptors) - 1, count).round().astype(int)
+    index = spread(len(descriptors), MAX_PROTOTYPES)
     return descriptors[index].half().cpu()

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from evercal.classes import frozen_arrays
-from evercal.geometry.camera import Camera
+from evercal.geometry import Camera, spread
 from evercal.typing import Array, Image, IntArray
 
 MIN_TEXTURE = 1e-4
@@ -100,9 +100,8 @@ def project_surface(
     (a, b), (c, d) = affines.transpose(1, 2, 0)
     area = a * d - b * c
     similar = np.flatnonzero((area > _MIN_AREA) & (area < _MAX_AREA))
-    if most is not None and len(similar) > most:
-        spread = np.linspace(0, len(similar) - 1, most)
-        similar = similar[spread.round().astype(int)]
+    if most is not None:
+        similar = similar[spread(len(similar), most)]
     return ProjectedPatches(visible[similar], pixels[similar], affines[similar])
 
 

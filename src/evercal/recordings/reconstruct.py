@@ -19,7 +19,7 @@ import numpy as np
 
 from evercal.classes import frozen
 from evercal.errors import InputError, optional_module
-from evercal.geometry import norms
+from evercal.geometry import norms, spread
 from evercal.recordings.images import write_image
 from evercal.recordings.pictures import is_blank
 from evercal.recordings.streams import StreamFrame, stream
@@ -184,8 +184,8 @@ def _match(pycolmap: Any, root: Path, names: list[str]) -> None:
         pycolmap.match_exhaustive(database)
         return
     pycolmap.match_sequential(database)
-    spread = np.linspace(0, len(names) - 1, _EXHAUSTIVE).round().astype(int)
-    pairs = itertools.combinations([names[i] for i in spread], 2)
+    some = [names[i] for i in spread(len(names), _EXHAUSTIVE)]
+    pairs = itertools.combinations(some, 2)
     file = root / "pairs.txt"
     lines = "".join(f"{first} {second}\n" for first, second in pairs)
     file.write_text(lines, encoding="utf-8")

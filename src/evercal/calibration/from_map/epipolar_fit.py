@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.from_map.image_pairs import ImagePair
-from evercal.geometry import SE3, cross_matrix
+from evercal.geometry import SE3, cross_matrix, spread
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount
 from evercal.typing import Array
@@ -67,9 +67,7 @@ class EpipolarFit:
         rays = []
         counts = []
         for pair in pairs:
-            matches = pair.rays.shape[1]
-            rows = np.linspace(0, matches - 1, min(matches, most)).round().astype(int)
-            rows = np.unique(rows)
+            rows = spread(pair.rays.shape[1], most)
             rays.append(pair.rays[:, rows])
             counts.append(len(rows))
         self.first, self.second = np.concatenate(rays, axis=1)
@@ -188,8 +186,7 @@ def first_rotation(
     Essential matrices would give it faster, but those of a small or flat thing may be wrong by any
     angle, and these distances are not.
     """
-    rows = np.linspace(0, len(pairs) - 1, FIRST_PAIRS).round().astype(int)
-    tried = [pairs[i] for i in np.unique(rows)]
+    tried = [pairs[i] for i in spread(len(pairs), FIRST_PAIRS)]
     epipolar = EpipolarFit(poses, tried, mount, FIRST_MATCHES)
     scale = np.deg2rad(ANGLE_DEG)
     best = Rotation.identity()

@@ -24,6 +24,7 @@ from evercal.geometry import (
     SE3,
     axis_deviation,
     pose_distance,
+    spread,
 )
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES
 from evercal.typing import Array, BoolArray, IntArray
@@ -95,13 +96,9 @@ def next_views(
         gripper_from_camera: A rough one. Default: unknown.
         excluded: Poses that are not proposed. Default: those recorded.
     """
-    mount = gripper_from_camera or SE3.identity()
-    scene_m = looked_at(recorded @ mount)
-    known = _known(recorded, gripper_from_camera, scene_m)
+    mount, scene_m, known = _known(recorded, gripper_from_camera)
     added = wrist_information(reachable, mount, scene_m)
-    return _chosen(
-        known, added, reachable, count, recorded if excluded is None else excluded
-    )
+    return _chosen(known, added, reachable, count, excluded or recorded)
 
 
 @frozen
@@ -143,9 +140,7 @@ def open_position(
     """
     if len(recorded) < MIN_GRIPPER_FRAMES:
         return None
-    mount = gripper_from_camera or SE3.identity()
-    scene_m = looked_at(recorded @ mount)
-    known = _known(recorded, gripper_from_camera, scene_m)
+    mount, scene_m, known = _known(recorded, gripper_from_camera)
     covariance = np.linalg.inv(known)
     variances, axes = np.linalg.eigh(covariance[:3, :3])
     along = axes[:, 2]
@@ -162,8 +157,7 @@ def open_position(
         f"{100 * step_m:.0f} cm aside without turning": shift[1:],
         f"turned by {_TURN_DEG:.0f} deg in place": turn,
     }
-    rows = np.linspace(0, len(recorded) - 1, _ADDED).round().astype(int)
-    begun = recorded[rows]
+    begun = recorded[spread(len(recorded), _ADDED)]
     then = {}
     for words, steps in motions.items():
         moved = begun @ SE3.exp(np.concatenate([steps, -steps]))
@@ -178,18 +172,20 @@ def open_position(
     return OpenPosition((x, y, z), float(sigmas[2]), float(sigmas[1]), best, then[best])
 
 
-def _known(recorded: SE3, gripper_from_camera: SE3 | None, scene_m: Array) -> Array:
-    """(13, 13) information about X, Z and the scale of the scene."""
+def _known(recorded: SE3, gripper_from_camera: SE3 | None) -> tuple[SE3, Array, Array]:
+    """X or none, the scene (3,), and information (13, 13) about X, Z and the scene's scale."""
     mount = gripper_from_camera or SE3.identity()
+    scene_m = looked_at(recorded @ mount)
     known = np.zeros((13, 13))
     known[:6, :6] = np.linalg.inv(_UNKNOWN if gripper_from_camera is None else _ROUGH)
     known[6:12, 6:12] = np.linalg.inv(_ANYWHERE)
     known[12, 12] = _ANY_SCALE**-2
-    return known + wrist_information(recorded, mount, scene_m).sum(0)
+    known += wrist_information(recorded, mount, scene_m).sum(0)
+    return mount, scene_m, known
 
 
 def _chosen(
-    known: Array, added: Array, reachable: SE3, count: int, excluded: SE3 | None
+    known: Array, added: Array, reachable: SE3, count: int, excluded: SE3
 ) -> NextViews:
     """Greedy choice by information `added` (n, N, N) to `known` (N, N); the first six matter."""
     if not len(reachable):
@@ -197,7 +193,7 @@ def _chosen(
             "no reachable poses; give at least one pose that the arm can go to"
         )
     free = np.trace(added, axis1=1, axis2=2) > 0
-    for pose in excluded if excluded is not None else ():
+    for pose in excluded:
         free &= ~_near(pose, reachable)
     chosen: list[int] = []
     sigmas = [axis_deviation(_of_six(known))]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from evercal.geometry import SE3, norms
+from evercal.geometry import SE3, norms, spread
 from evercal.recordings.frame import Frame
 from evercal.typing import Array, Float32Array
 
@@ -200,9 +200,7 @@ def _pairs(poses: SE3) -> list[tuple[int, int]]:
     """
     rotation = poses.rotation
     pairs = []
-    spread = np.linspace(0, len(poses) - 2, PAIRS)
-    firsts = np.unique(spread.round().astype(int))
-    for i, first in enumerate(firsts):
+    for i, first in enumerate(spread(len(poses) - 1, PAIRS)):
         end = min(first + 1 + MAX_FRAMES_APART, len(poses))
         later = np.arange(first + 1, end)
         difference = rotation[first].inv() * rotation[later]
