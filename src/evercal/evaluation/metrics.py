@@ -130,7 +130,8 @@ def correct(
 ) -> dict[str, BoolArray]:
     """Which frames (frames,) of each scene are correct, by thresholds in metres and radians."""
     return {
-        name: _correct(rows, thresholds) for name, rows in _by_scene(results).items()
+        name: correct_rows(rows, thresholds)
+        for name, rows in _by_scene(results).items()
     }
 
 
@@ -212,39 +213,41 @@ def _by_scene(results: Iterable[FrameResult]) -> dict[str, list[FrameResult]]:
 
 
 def _scene_scores(rows: list[FrameResult]) -> SceneScores:
-    status = _column(rows, "status")
+    status = column(rows, "status")
     return SceneScores(
         frames=len(rows),
-        accuracy_5cm_5deg=_percent(_correct(rows, COARSE)),
-        accuracy_2cm_2deg=_percent(_correct(rows, MIDDLE)),
-        accuracy_1cm_1deg=_percent(_correct(rows, FINE)),
-        accuracy_5mm_05deg=_percent(_correct(rows, FINEST)),
-        median_translation_cm=100.0 * _upper_median(rows, "translation_error_m"),
-        median_rotation_deg=math.degrees(_upper_median(rows, "rotation_error_rad")),
-        wrong_scene=_percent(_column(rows, "wrong_scene")),
+        accuracy_5cm_5deg=_percent(correct_rows(rows, COARSE)),
+        accuracy_2cm_2deg=_percent(correct_rows(rows, MIDDLE)),
+        accuracy_1cm_1deg=_percent(correct_rows(rows, FINE)),
+        accuracy_5mm_05deg=_percent(correct_rows(rows, FINEST)),
+        median_translation_cm=100.0 * upper_median(rows, "translation_error_m"),
+        median_rotation_deg=math.degrees(upper_median(rows, "rotation_error_rad")),
+        wrong_scene=_percent(column(rows, "wrong_scene")),
         unknown=_percent(np.isin(status, ("uncertain", "unknown_scene", "ambiguous"))),
-        near_training_frame=_percent(_column(rows, "near_training_frame")),
-        inside_95=share_inside(_column(rows, "squared_mahalanobis")),
+        near_training_frame=_percent(column(rows, "near_training_frame")),
+        inside_95=share_inside(column(rows, "squared_mahalanobis")),
     )
 
 
-def _correct(rows: Iterable[FrameResult], thresholds: Thresholds) -> BoolArray:
+def correct_rows(rows: Iterable[FrameResult], thresholds: Thresholds) -> BoolArray:
+    """Which rows (n,) are correct, by thresholds in metres and radians."""
     metres, radians = thresholds
-    near = _column(rows, "translation_error_m") < metres
-    return near & (_column(rows, "rotation_error_rad") < radians)
+    near = column(rows, "translation_error_m") < metres
+    return near & (column(rows, "rotation_error_rad") < radians)
 
 
-def _upper_median(rows: Iterable[FrameResult], name: str) -> float:
+def upper_median(rows: Iterable[FrameResult], name: str) -> float:
     """The upper median: a mean of the two middle errors may include infinity."""
-    values = np.sort(_column(rows, name))
+    values = np.sort(column(rows, name))
     return float(values[len(values) // 2])
 
 
 def _mean(rows: Iterable[SceneScores | FrameResult], name: str) -> float:
-    return float(np.mean(_column(rows, name)))
+    return float(np.mean(column(rows, name)))
 
 
-def _column(rows: Iterable[SceneScores | FrameResult], name: str) -> np.ndarray:
+def column(rows: Iterable[SceneScores | FrameResult], name: str) -> np.ndarray:
+    """The values (n,) of a field."""
     return np.array([getattr(row, name) for row in rows])
 
 

@@ -79,21 +79,21 @@ class StageResults:
 
 def scene_row(frames: Sequence[metrics.FrameResult]) -> JsonObject:
     """Summarize the test frames of one scene: columns of results.csv that depend on them."""
-    metres = np.array([frame.translation_error_m for frame in frames])
-    radians = np.array([frame.rotation_error_rad for frame in frames])
-    squared = np.array([frame.squared_mahalanobis for frame in frames])
-    wrong = np.array([frame.wrong_scene for frame in frames])
-    middle = len(frames) // 2  # a mean of the two middle errors may include infinity
+    metres = metrics.column(frames, "translation_error_m")
+    squared = metrics.column(frames, "squared_mahalanobis")
+    wrong = metrics.column(frames, "wrong_scene")
+    middle_m = metrics.upper_median(frames, "translation_error_m")
+    middle_rad = metrics.upper_median(frames, "rotation_error_rad")
     within = {
-        name: int(((metres < most_m) & (radians < most_rad)).sum())
-        for name, (most_m, most_rad) in WITHIN.items()
+        name: int(metrics.correct_rows(frames, most).sum())
+        for name, most in WITHIN.items()
     }
     return {
         "scene": frames[0].scene,
         "frames": len(frames),
         **within,
-        "median_mm": round(1000 * float(np.sort(metres)[middle]), 3),
-        "median_deg": round(math.degrees(np.sort(radians)[middle]), 4),
+        "median_mm": round(1000 * middle_m, 3),
+        "median_deg": round(math.degrees(middle_rad), 4),
         "area_20cm": round(metrics.recall_area(metres), 4),
         "wrong_scene": int(wrong.sum()),
         "refused": int((~np.isfinite(metres) & ~wrong).sum()),
