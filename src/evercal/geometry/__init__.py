@@ -12,6 +12,8 @@ from evercal.geometry.se3 import norms as norms
 from evercal.geometry.se3 import pose_distance as pose_distance
 from evercal.geometry.se3 import pose_distance_mm_deg as pose_distance_mm_deg
 from evercal.geometry.se3 import pose_to_dict as pose_to_dict
+from evercal.geometry.se3 import rotation_error as rotation_error
+from evercal.geometry.se3 import unit_vectors as unit_vectors
 from evercal.geometry.uncertain_pose import UncertainPose as UncertainPose
 from evercal.geometry.uncertain_pose import axis_deviation as axis_deviation
 from evercal.geometry.uncertain_pose import in_parent_axes as in_parent_axes

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry.camera import Camera
-from evercal.geometry.se3 import norms
+from evercal.geometry.se3 import norms, unit_vectors
 from evercal.typing import Array
 
 MIDDLE = (0.1, 0.9)
@@ -57,9 +57,9 @@ def fit_rays(own: Camera, other: Camera) -> RayFit:
     rays = rays[:, np.isfinite(rays).all((0, 2))]
     if rays.shape[1] < 3:
         raise ValueError("the distortion leaves no rays in the middle of the image")
-    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    turn = Rotation.align_vectors(*rays)[0]
-    return RayFit(turn, rays[0], turn.apply(rays[1]))
+    own_rays, other_rays = unit_vectors(rays)
+    turn = Rotation.align_vectors(own_rays, other_rays)[0]
+    return RayFit(turn, own_rays, turn.apply(other_rays))
 
 
 def turn_by_lens(camera: Camera, terms: int) -> Array:

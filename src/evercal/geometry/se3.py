@@ -102,8 +102,7 @@ class SE3:
                 "the last row of a pose matrix is 0 0 0 1, got something else"
             )
         block = matrix[..., :3, :3]
-        gram = np.swapaxes(block, -1, -2) @ block
-        drift = np.abs(gram - np.eye(3)).max(initial=0.0)
+        drift = rotation_error(block).max(initial=0.0)
         if drift > tolerance:
             raise ValueError(
                 f"the left 3x3 block of a pose matrix is a rotation within {tolerance:g},"
@@ -316,6 +315,12 @@ def norms(vectors: ArrayLike) -> Array:
     return np.linalg.norm(vectors, axis=-1)
 
 
+def unit_vectors(vectors: Array, least: float = 1e-12) -> Array:
+    """Vectors (..., k) of length 1; those shorter than `least` are divided by it."""
+    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.maximum(lengths, least)
+
+
 def cross_matrix(v: ArrayLike) -> Array:
     """(..., 3, 3) matrices of the cross product with vectors (..., 3)."""
     v = np.asarray(v, float)
@@ -324,6 +329,12 @@ def cross_matrix(v: ArrayLike) -> Array:
     matrix[..., 0, 2] = v[..., 1]
     matrix[..., 1, 2] = -v[..., 0]
     return matrix - np.swapaxes(matrix, -1, -2)
+
+
+def rotation_error(blocks: Array) -> Array:
+    """(..., 3, 3) absolute entries of R^T R - I of matrices (..., 3, 3)."""
+    gram = np.swapaxes(blocks, -1, -2) @ blocks
+    return np.abs(gram - np.eye(3))
 
 
 def _quaternion(matrix: Array) -> Array:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, unit_vectors
 from evercal.mapping.plane_sweep import PosedCells
 from evercal.typing import Array, BoolArray
 
@@ -67,8 +67,7 @@ def _shown(
     """Whether each camera shows each probed cell (n, 64), and cosines of the parallax."""
     cells = np.linspace(0, len(depth_m) - 1, PROBED_CELLS).astype(int)
     points = view.base_from_camera.apply(view.rays()[cells] * depth_m[cells, None])
-    ray = points - view.base_from_camera.translation_m
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    ray = unit_vectors(points - view.base_from_camera.translation_m)
     others = points - poses.translation_m[:, None]
     local = others @ poses.rotation_matrix()
     visible = local[..., 2] > 0

@@ -4,7 +4,7 @@ from itertools import product
 
 import numpy as np
 
-from evercal.geometry import SE3, norms
+from evercal.geometry import SE3, norms, unit_vectors
 from evercal.robot.arm import Arm
 from evercal.robot.inverse_kinematics import inverse_kinematics
 from evercal.typing import Array
@@ -76,24 +76,17 @@ def _usual(
     ahead = np.stack([np.cos(azimuth), np.sin(azimuth), zero], 1)
     side = np.cross(np.eye(3)[2], ahead)
     away = wrist - shoulder
-    half = (
-        np.linalg.norm(
-            away,
-            axis=1,
-            keepdims=True,
-        )
-        / 2
-    )
+    half = norms(away)[:, None] / 2
     longest = norms(position - shoulder).max()
     link_m = np.maximum(link * longest, 1.02 * half)
-    up = _unit(np.cross(away, side))
+    up = unit_vectors(np.cross(away, side))
     up *= np.sign(up[:, 2:])
     elbow = shoulder + away / 2 + up * np.sqrt(link_m**2 - half**2)
-    upper = _unit(elbow - shoulder)
-    fore = _unit(wrist - elbow)
-    hinge = _unit(np.cross(upper, fore))
-    bend = _unit(np.cross(fore, forward))
-    across = _unit(np.cross(side, forward))
+    upper = unit_vectors(elbow - shoulder)
+    fore = unit_vectors(wrist - elbow)
+    hinge = unit_vectors(np.cross(upper, fore))
+    bend = unit_vectors(np.cross(fore, forward))
+    across = unit_vectors(np.cross(side, forward))
     axes = [side, hinge, fore, bend, upper, side, across, ahead]
     points = [shoulder, elbow, wrist, wrist, shoulder, wrist, wrist, shoulder]
     turns = np.stack(axes, 2) * _WEIGHTS
@@ -104,12 +97,3 @@ def _usual(
     )
     back = gripper.swapaxes(1, 2)
     return np.concatenate([back @ shifts, back @ turns], 1)
-
-
-def _unit(vectors: Array) -> Array:
-    lengths = np.linalg.norm(
-        vectors,
-        axis=1,
-        keepdims=True,
-    )
-    return vectors / lengths.clip(1e-12)

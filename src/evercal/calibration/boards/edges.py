@@ -5,7 +5,7 @@ import numpy as np
 
 from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.corners import BoardView
-from evercal.geometry import norms
+from evercal.geometry import norms, unit_vectors
 from evercal.typing import Array, Image
 
 _NEIGHBOURS = 8
@@ -185,8 +185,7 @@ def _edges(
     """
     sides = ends - starts
     across = np.stack([sides[:, 1], -sides[:, 0]], 1)
-    across /= np.maximum(np.linalg.norm(sides, axis=1, keepdims=True), 1e-9)
-    across = across[:, None]
+    across = unit_vectors(across, 1e-9)[:, None]
     offsets = np.linspace(-1, 1, 33) * np.nan_to_num(reach)[:, None]
     offsets = offsets[:, None]
     points = starts[:, None] + np.linspace(0, 1, count)[:, None] * sides[:, None]

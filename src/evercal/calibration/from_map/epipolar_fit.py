@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.from_map.image_pairs import ImagePair
-from evercal.geometry import SE3, cross_matrix, spread
+from evercal.geometry import SE3, cross_matrix, spread, unit_vectors
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount
 from evercal.typing import Array
@@ -136,9 +136,7 @@ class EpipolarFit:
         first = camera[..., self.ends[:, 0], :, :]
         second = camera[..., self.ends[:, 1], :, :]
         second_from_first = np.linalg.inv(second) @ first
-        baseline = second_from_first[..., :3, 3]
-        length = np.linalg.norm(baseline, axis=-1, keepdims=True)
-        direction = baseline / np.maximum(length, 1e-9)
+        direction = unit_vectors(second_from_first[..., :3, 3], 1e-9)
         essential = cross_matrix(direction) @ second_from_first[..., :3, :3]
         essential = essential[..., self.number, :, :]
         in_second = (essential @ self.first[..., None])[..., 0]

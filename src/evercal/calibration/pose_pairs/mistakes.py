@@ -25,7 +25,7 @@ from evercal.calibration.pose_pairs.readings import (
 )
 from evercal.calibration.pose_pairs.starts import quick_fit
 from evercal.errors import InputError
-from evercal.geometry import norms
+from evercal.geometry import norms, unit_vectors
 from evercal.robot.mount import MountName, mount_named
 
 _MAX_METRES = 0.01
@@ -157,7 +157,7 @@ def _require_plausible(
 ) -> None:
     """Refuse pairs that agree, but whose geometry fits another reading far better."""
     board = given.pairs.camera_from_board.translation_m
-    rays = board / norms(board)[:, None].clip(1e-9)
+    rays = unit_vectors(board, 1e-9)
     behind = (rays[:, 2] < 0).mean() > _MOST
     mean = rays.mean(0)
     coherent = float(np.linalg.norm(mean))

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from evercal.classes import frozen_arrays
-from evercal.geometry import SE3, cross_matrix
+from evercal.geometry import SE3, cross_matrix, unit_vectors
 from evercal.robot.pose_errors import SharedErrors
 from evercal.typing import Array, BoolArray, IntArray, JsonObject, Strings
 
@@ -250,9 +250,8 @@ class PoseEquation:
         }
         if "intrinsics" not in self.extras.groups:
             ray = board - parent - self.robot_rotation @ at.translations[0]
-            length = np.linalg.norm(ray, axis=1, keepdims=True)
             depth = np.zeros((n, 6, 1))
-            depth[:, :3, 0] = ray / np.maximum(length, 1e-9)
+            depth[:, :3, 0] = unit_vectors(ray, 1e-9)
             directions["depth"] = depth
             directions["rotation about board"] = _rotated(np.zeros((n, 3)))
         return directions

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.random import Generator
 
 from evercal.continual.selection.frame_statistics import FrameStatistics
-from evercal.geometry import norms
+from evercal.geometry import norms, unit_vectors
 from evercal.mapping.selection import SarsOptions, select_sars
 from evercal.typing import Array, IntArray
 
@@ -39,7 +39,7 @@ def select_herding(features: Array, capacity: int) -> IntArray:
     Each next frame is the one that brings the mean of the selection closest to the mean of all
     frames. Ties go to the earlier frame. The rows of features (n, c) are scaled to unit length.
     """
-    unit = _unit(features)
+    unit = unit_vectors(features)
     if not len(unit):
         return _sorted([])
     mean = unit.mean(0)
@@ -115,7 +115,7 @@ def select_gradients(gradients: Array, capacity: int, rng: Generator) -> IntArra
     then replaces a buffered frame i, drawn by its score c_i, with probability c_i / (c_i + c). The
     gradients (n, p) are those of the loss on each frame.
     """
-    unit = _unit(gradients)
+    unit = unit_vectors(gradients)
     selected = np.zeros(0, int)
     scores = np.zeros(0)
     if not capacity:
@@ -142,12 +142,6 @@ def select_gradients(gradients: Array, capacity: int, rng: Generator) -> IntArra
 
 def _sorted(frames: list[int]) -> IntArray:
     return np.sort(np.array(frames, np.int64))
-
-
-def _unit(rows: Array) -> Array:
-    rows = np.asarray(rows, float)
-    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    return rows / np.maximum(lengths, 1e-12)
 
 
 Select = Callable[[FrameStatistics, int], IntArray]

@@ -19,8 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from evercal.classes import frozen
-from evercal.geometry import norms
-from evercal.geometry.se3 import SE3
+from evercal.geometry import SE3, norms, rotation_error
 from evercal.recordings.poses.row_files import by_alias
 from evercal.typing import Array, BoolArray, JsonObject
 
@@ -288,8 +287,7 @@ def matrices_from_numbers(numbers: Array, layout: str) -> Array:
 def _rigid(matrices: Array) -> BoolArray:
     """(...) whether matrices (..., 3 or 4, 4) are rigid transforms."""
     block = matrices[..., :3, :3]
-    gram = np.swapaxes(block, -1, -2) @ block
-    drift = np.abs(gram - np.eye(3))
+    drift = rotation_error(block)
     orthogonal = drift.max((-1, -2), initial=0.0) < _TOLERANCE
     proper = np.linalg.det(block) > 0
     drift = np.abs(matrices[..., 3:, :] - (0.0, 0.0, 0.0, 1.0))

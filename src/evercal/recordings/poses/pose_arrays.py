@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from evercal.geometry import rotation_error
 from evercal.recordings.poses.conventions import Given
 from evercal.recordings.poses.pose_columns import HEADERS, PoseTable, named_numbers
 from evercal.recordings.poses.row_files import name_and_unit, number_array, text_cells
@@ -103,11 +104,8 @@ def poses_first(array: Array, shapes: tuple[tuple[int, int], ...]) -> Array:
     """(n, rows, columns) matrices of an array that has the poses last, as in MATLAB."""
     if array.ndim != 3 or array.shape[:2] not in shapes:
         return array
-    if array.shape[1:] in shapes:
-        # Four matrices may lie along either axis: rotations are orthogonal along the right one.
-        block = array[..., :3, :3]
-        gram = np.swapaxes(block, 1, 2) @ block
-        error = np.abs(gram - np.eye(3)).max()
-        if error < 0.01:
-            return array
+    # Four matrices may lie along either axis: rotations are orthogonal along the right one.
+    is_cube = array.shape[1:] in shapes
+    if is_cube and rotation_error(array[..., :3, :3]).max() < 0.01:
+        return array
     return np.moveaxis(array, -1, 0)
