@@ -34,7 +34,7 @@ COEFFICIENTS: dict[str, Strings] = {
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
 """Names of the distortion coefficients of each model, in OpenCV's order."""
-_COEFFICIENT_COUNTS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
+COEFFICIENT_COUNTS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
 """Allowed numbers of coefficients of each model."""
 _EXACT = 1e-10
 """Tolerance of undistorted points on the plane z = 1."""
@@ -87,10 +87,10 @@ class Camera:
                     f"camera {name} is finite (and > 0 for fx, fy), got {value}"
                 )
             object.__setattr__(self, name, value)
-        if self.model not in _COEFFICIENT_COUNTS:
+        if self.model not in COEFFICIENT_COUNTS:
             raise ValueError(f"camera model is pinhole or fisheye, got {self.model!r}")
         distortion = tuple(float(value) for value in self.distortion)
-        counts = _COEFFICIENT_COUNTS[self.model]
+        counts = COEFFICIENT_COUNTS[self.model]
         if len(distortion) not in counts or not all(map(math.isfinite, distortion)):
             names = " ".join(COEFFICIENTS[self.model])
             raise ValueError(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from evercal.geometry import Camera
-from evercal.geometry.camera import COEFFICIENTS
+from evercal.geometry.camera import COEFFICIENT_COUNTS, COEFFICIENTS
 from evercal.recordings.cameras.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.poses.row_files import by_alias, is_number
 from evercal.storage.text_files import few
@@ -69,8 +69,6 @@ DISTORTION = ("distortion_coefficients", *_PINHOLE)
 """Names of fields that hold distortion."""
 _UNIQUE = {*_NAMES.values(), *_PINHOLE}
 """Fields that may be stated once."""
-_LENGTHS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
-"""Numbers of coefficients that a model may have."""
 _CAMERA_INFO = {
     "rectificationmatrix",
     "projectionmatrix",
@@ -223,8 +221,8 @@ def _distortion(fields: Fields, model: str) -> tuple[float, ...] | None:
     else:
         return None
     # Longer models add terms that are mostly zero and can then be dropped.
-    lengths = _LENGTHS[model]
-    while len(numbers) not in lengths and numbers[-1] == 0:
+    counts = COEFFICIENT_COUNTS[model]
+    while len(numbers) not in counts and numbers[-1] == 0:
         numbers.pop()
     return tuple(numbers)
 
