@@ -62,9 +62,8 @@ def consensus_start(equation: PoseEquation, scale_known: bool = True) -> Start:
         j[None],
         scale_known,
     )
-    rotations = np.concatenate([samples.rotations, whole.rotations])
-    shifts = np.concatenate([samples.translations, whole.translations])
-    scales = np.concatenate([samples.scales, whole.scales])
+    pairs = zip(samples, whole, strict=True)
+    rotations, shifts, scales = map(np.concatenate, pairs)
     # (h, n) board poses in the fixed frame by each hypothesis.
     fixed_from_camera = scored.robot_rotation @ rotations[:, None]
     board_rotations = fixed_from_camera @ scored.camera_rotation
