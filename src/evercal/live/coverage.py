@@ -192,15 +192,15 @@ def _missing(
         missing.append(f"{MIN_GRIPPER_FRAMES - good} more images to start with")
     # Two axes of rotation are necessary, the third one makes the result better.
     rotations_left = _uncovered(rotations)
-    positions_left = _uncovered(positions)
     if rank < 2 and not rotations_left:
         missing.insert(0, "rotations about a second axis: tilt and turn independently")
-    for axis in rotations_left:
-        wanted = f"{axis.spread:.0f} deg, {ROTATION_DEG:.0f} wanted"
-        missing.append(f"rotations {axis.name} ({wanted})")
-    for axis in positions_left:
-        wanted = f"{axis.spread:.0f} mm, {POSITION_MM:.0f} wanted"
-        missing.append(f"positions {axis.name} ({wanted})")
+    for what, unit, least, axes in (
+        ("rotations", "deg", ROTATION_DEG, rotations_left),
+        ("positions", "mm", POSITION_MM, _uncovered(positions)),
+    ):
+        for axis in axes:
+            wanted = f"{axis.spread:.0f} {unit}, {least:.0f} wanted"
+            missing.append(f"{what} {axis.name} ({wanted})")
     if MIN_GRIPPER_FRAMES <= good < IMAGES:
         missing.append(f"{IMAGES - good} more images")
     return tuple(missing)
