@@ -233,7 +233,7 @@ def align_by_points(
 
 
 def _about(point: Array, covariance: Array) -> Array:
-    adjoint = SE3(np.array([1.0, 0, 0, 0]), point).adjoint()
+    adjoint = SE3.from_translation(point).adjoint()
     return adjoint @ covariance @ adjoint.T
 
 

@@ -129,7 +129,6 @@ def hand_eye_of(
     )
     if correction.arm is not None:
         calibration = _with_joints(calibration, correction.arm, frames)
-        calibration = _with_open_joint(calibration, correction.arm, frames)
     warnings = (*_warnings(built.adjusted), *warnings)
     advice = _advice(frames, estimate) if start.mount.moves else ""
     return HandEye(
@@ -211,23 +210,18 @@ def _checks(correction: HandEyeCorrection) -> Checks:
 
 
 def _with_joints(
-    calibration: Calibration, arm: ArmOffsets, frames: Sequence[Frame]
-) -> Calibration:
-    return replace(
-        calibration,
-        joints=_joint_offsets(arm),
-        joint_covariance=arm.covariance,
-        checks=replace(calibration.checks, joints_move_mm=_moved_mm(arm, frames)),
-    )
-
-
-def _with_open_joint(
     calibration: Calibration, offsets: ArmOffsets, frames: Sequence[Frame]
 ) -> Calibration:
-    """Add what an offset of the joint at the camera does, which no image shows.
+    """Add the offsets, and what that of the joint at the camera does, which no image shows.
 
     It turns the gripper, or the base of a fixed camera, and the camera with it.
     """
+    calibration = replace(
+        calibration,
+        joints=_joint_offsets(offsets),
+        joint_covariance=offsets.covariance,
+        checks=replace(calibration.checks, joints_move_mm=_moved_mm(offsets, frames)),
+    )
     end = -1 if offsets.mount.moves else 0
     joint = offsets.arm.chain[end].value
     if offsets.arm.free()[joint]:
