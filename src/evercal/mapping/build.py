@@ -307,25 +307,26 @@ def _finish(
     numbers = np.array([keyframe.frame for keyframe in tracks])
     stated = frames.frames[0].camera
     camera = frames.cameras[0].resized(stated.width, stated.height)
-    adjusted = Adjusted(wrong_poses=prepared.wrong, untracked=prepared.untracked)
+    adjusted = Adjusted()
     frame = MapFrame()
     hand_eye = None
     if adjustment is not None:
         doubtful = np.flatnonzero(adjustment.weight < DOUBTFUL_WEIGHT)
+        frame = _map_frame(adjustment, numbers, options)
         adjusted = replace(
             Adjusted.of(adjustment, stated, camera),
-            wrong_poses=prepared.wrong,
-            untracked=prepared.untracked,
             doubtful_poses=frames.names(doubtful),
+            shared_mm=1000 * frame.shared_m,
         )
-        frame = _map_frame(adjustment, numbers, options)
-        adjusted = replace(adjusted, shared_mm=1000 * frame.shared_m)
         if not options.bundle.common_stated:
             # The common transform is part of the answer and not an error to undo.
             hand_eye = _hand_eye(frames, adjustment, options)
             corrected = frames.stated @ adjustment.common
             covariance = frame_covariance(corrected, hand_eye.covariance)
             frame = replace(frame, common=SE3.identity(), base_covariance=covariance)
+    adjusted = replace(
+        adjusted, wrong_poses=prepared.wrong, untracked=prepared.untracked
+    )
     if prepared.unit is not None:
         similarity = Similarity(SE3.identity(), prepared.unit, metric=False)
         frame = replace(frame, similarity=similarity)

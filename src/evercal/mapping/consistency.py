@@ -100,8 +100,8 @@ def require_landmarks(arrays: Mapping[str, Any], cameras: Sequence[Camera]) -> N
     sides = [(camera.width, camera.height) for camera in cameras]
     size = np.repeat(np.array(sides, np.int32), counts, axis=0)
     _require(len(pixels), "a scene has landmarks")
-    _require((pixels >= 0).all(), "landmarks lie in their images")
-    _require((pixels < size).all(), "landmarks lie in their images")
+    inside = (pixels >= 0) & (pixels < size)
+    _require(inside.all(), "landmarks lie in their images")
     _require((depths > 0).all(), "landmarks have depths")
     for name in ("inverse_depth", "sigma", "slope"):
         _require_small("landmarks", arrays[f"landmark_{name}"][:])
