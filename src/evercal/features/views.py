@@ -4,7 +4,6 @@ An augmented view is the image of a camera with another rotation and focal lengt
 centre. That image does not depend on the depths, so its pose is exact.
 """
 
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -105,8 +104,7 @@ def augmented_view(
     rotation = SE3.exp(tangent)
     camera_from_view = rotation.rotation_matrix()
     height, width = grey.shape
-    virtual = camera.zoomed(zoom)
-    virtual = replace(virtual, distortion=(), model="pinhole")
+    virtual = camera.zoomed(zoom).pinhole
     if camera.distortion:
         v, u = np.mgrid[0:height, 0:width]
         places = np.stack([u, v], -1).astype(float)

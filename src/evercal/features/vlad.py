@@ -114,7 +114,5 @@ def similar_pairs(
     pairs = set()
     for i, row in enumerate(nearest):
         for j in row:
-            first = min(i, j)
-            second = max(i, j)
-            pairs.add((first, second))
+            pairs.add((min(i, j), max(i, j)))
     return sorted(pairs)
