@@ -131,8 +131,20 @@ class BoxRoom:
         image = np.zeros((camera.height, camera.width, 3), np.uint8)
         nearness = np.zeros((camera.height, camera.width), np.float32)  # 1 / depth
         camera_from_base = base_from_camera.inverse()
+        rotation = camera_from_base.rotation_matrix()
         for surface in (*self.surfaces, *moving):
-            draw(image, nearness, surface.moved(camera_from_base), camera)
+            corner_m = camera_from_base.apply(surface.corner_m)
+            edge_u = rotation @ surface.edge_u_m
+            edge_v = rotation @ surface.edge_v_m
+            edges = np.stack([edge_u, edge_v], -1)
+            draw(
+                image,
+                nearness,
+                surface.pyramid,
+                corner_m,
+                edges,
+                camera,
+            )
         return image
 
     def intersect(

@@ -90,7 +90,18 @@ def arm_surfaces(joints_rad: Array) -> list[Surface]:
 
 def thing_surfaces(seed: int, base_from_gripper: SE3) -> list[Surface]:
     """The textured box that the gripper holds."""
-    return [surface.moved(base_from_gripper) for surface in _thing(seed)]
+    rotation = base_from_gripper.rotation_matrix()
+    surfaces = []
+    for thing in _thing(seed):
+        surfaces.append(
+            Surface(
+                corner_m=base_from_gripper.apply(thing.corner_m),
+                edge_u_m=rotation @ thing.edge_u_m,
+                edge_v_m=rotation @ thing.edge_v_m,
+                pyramid=thing.pyramid,
+            )
+        )
+    return surfaces
 
 
 @lru_cache(maxsize=4)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from evercal.classes import frozen
-from evercal.geometry import SE3, Camera
+from evercal.geometry import Camera
 from evercal.typing import Array, BoolArray, Image
 
 NEAR_M = 0.05
@@ -38,16 +38,6 @@ class Surface:
     edge_v_m: Array
     """(3,) along texture rows."""
     pyramid: Pyramid
-
-    def moved(self, pose: SE3) -> "Surface":
-        """The rectangle in another frame, by the pose of its own frame there."""
-        rotation = pose.rotation_matrix()
-        return Surface(
-            pose.apply(self.corner_m),
-            rotation @ self.edge_u_m,
-            rotation @ self.edge_v_m,
-            self.pyramid,
-        )
 
     @cached_property
     def normal(self) -> Array:
@@ -118,14 +108,15 @@ def _window(corners: Array, camera: Camera) -> tuple[slice, slice] | None:
 def draw(
     image: Image,
     nearness: Array,
-    surface: Surface,
+    pyramid: Pyramid,
+    corner: Array,
+    edges: Array,
     camera: Camera,
 ) -> None:
     """Warp a rectangle in camera coordinates into `image` where it is nearest, by `nearness`."""
-    corner = surface.corner_m
-    if np.cross(surface.edge_u_m, surface.edge_v_m) @ corner >= 0:  # back side
+    edge_u, edge_v = edges.T
+    if np.cross(edge_u, edge_v) @ corner >= 0:  # back side
         return
-    edges = np.stack([surface.edge_u_m, surface.edge_v_m], -1)
     window = _window(corner + _CORNERS @ edges.T, camera)
     if window is None:
         return
@@ -151,10 +142,10 @@ def draw(
         return
     # The pyramid level follows from texture pixels per image pixel over the visible area.
     covered = np.ptp(s[visible]) * np.ptp(t[visible])
-    texture_pixels = covered * len(surface.pyramid[0]) ** 2
+    texture_pixels = covered * len(pyramid[0]) ** 2
     ratio = texture_pixels / visible.sum()
     level = np.round(0.5 * np.log2(max(ratio, 1.0)))
-    texture = surface.pyramid[min(int(level), len(surface.pyramid) - 1)]
+    texture = pyramid[min(int(level), len(pyramid) - 1)]
     height, width, _ = texture.shape
     column = np.where(visible, s * width - 0.5, 0)
     row = np.where(visible, t * height - 0.5, 0)
