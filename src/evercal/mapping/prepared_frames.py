@@ -158,12 +158,15 @@ class PreparedFrames:
             count,
         )
 
+    def pyramid(self, i: int) -> list[np.ndarray]:
+        """Image pyramid of a frame."""
+        return self._pyramid(i)
+
     def _cache_pyramids(self) -> None:
         grey = self.grey
-        self.pyramid = lru_cache(_PYRAMIDS * cores())(
+        self._pyramid = lru_cache(_PYRAMIDS * cores())(
             lambda i: image_pyramid(grey[i], PYRAMID_LEVELS)
         )
-        """Image pyramid of a frame, by its number."""
 
     def relative(self, j: int, k: int) -> tuple[np.ndarray, np.ndarray]:
         """Rotation (3, 3) and translation (3,) of camera j from camera k."""
