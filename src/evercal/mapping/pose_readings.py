@@ -18,7 +18,6 @@ from evercal.mapping.pose_check import (
     depth_scale,
 )
 from evercal.mapping.prepared_frames import PreparedFrames
-from evercal.recordings.poses.conventions import OPENGL_FROM_OPENCV
 
 MOST_CONTRADICTING = 1 / 3
 """Share of contradicting pairs above which other readings are tried; of right poses 0.10 at most
@@ -32,6 +31,7 @@ MOST_WRONG = 0.25
 its five partners in more than a tenth of the cases."""
 MIN_PAIRS = 20
 """Pairs below which there is no verdict."""
+_GL = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
 
 
 def require_consistent(
@@ -81,7 +81,7 @@ def _readings(stated: SE3) -> Iterator[tuple[str, SE3]]:
     quaternions = stated.rotation_wxyz
     positions = stated.translation_m
     yield "camera_from_base, the inverse", stated.inverse()
-    yield "with OpenGL's camera axes (right, up, backward)", stated @ OPENGL_FROM_OPENCV
+    yield "with OpenGL's camera axes (right, up, backward)", stated @ _GL
     for step, order in ((-1, "w, x, y, z"), (1, "x, y, z, w")):
         reordered = SE3(np.roll(quaternions, step, axis=1), positions)
         yield f"with quaternions in the order {order}", reordered
