@@ -327,7 +327,9 @@ def test_parts_are_left_out_with_the_keyframes_near_them(
         assert set(part.keyframes.tolist()) == set(np.flatnonzero(away > 10).tolist())
         assert 0 < len(part.keyframes) < len(recorded)
     assert built.left_out(frames[:29]) == []
-    moved = HandEyeCorrection(SE3.identity(), np.eye(6), np.eye(6), np.eye(6), {}, {})
+    none: dict[str, np.ndarray] = {}
+    start = SE3.identity()
+    moved = HandEyeCorrection(start, *[np.eye(6)] * 3, none, none, none)
     assert replace(built, hand_eye=moved).left_out(frames) == []
 
 

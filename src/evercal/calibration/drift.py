@@ -80,7 +80,7 @@ def check(
 ) -> Shift:
     """Test whether a camera has moved since its calibration, see `Map.check`."""
     _require_fixed(reference)
-    localizer = _of_reference(localizer, reference)
+    localizer = within_reference(localizer, reference)
     located = locate(localizer, images, camera or reference.camera, on_image)
     if not shows_held_thing(localizer, located, base_from_gripper):
         return shift_between(reference, fuse(located), located, localizer)
@@ -129,8 +129,8 @@ def shift_between(
     return replace(shift, same_map=same)
 
 
-def _of_reference(localizer: "Localizer", reference: Calibration) -> "Localizer":
-    """The localizer within the scene that the reference was calibrated in, if it is there."""
+def within_reference(localizer: "Localizer", reference: Calibration) -> "Localizer":
+    """The localizer within the scene that a camera was calibrated in, if it is there."""
     for scene in localizer.contents.scenes:
         named = scene.name == reference.source.get("scene")
         if named and scene.digest == reference.source.get("map"):

@@ -48,6 +48,7 @@ class Verify(args.Verb):
     """New images of a mapped scene, or a folder of them."""
     store: Annotated[Path | None, args.shown("MAP")] = None
     """Map of the scene that the images show."""
+    scene: args.Scenes = ()
     board_poses: args.File = None
     """Board poses from 'evercal detect'."""
     target_pose: args.File = None
@@ -173,6 +174,7 @@ class Verify(args.Verb):
 
     def _target(self, calibration: "Calibration") -> "tuple[Target, dict[str, SE3]]":
         from evercal.calibration.boards.board_poses import read_board_poses
+        from evercal.calibration.drift import within_reference
         from evercal.calibration.located import locate
         from evercal.calibration.unseen.targets import board_target, scene_target
         from evercal.recordings.image_files import image_files
@@ -187,7 +189,8 @@ class Verify(args.Verb):
                 "give --picks, --board-poses, or images with the --store that maps their scene"
             )
         files = image_files(self.images)
-        localizer = args.open_map(self.store)
+        localizer = args.open_map(self.store, self.scene)
+        localizer = within_reference(localizer, calibration)
         named = [(str(file), file) for file in files]
         with progress_bar("localizing", len(files), "image") as bar:
             located = locate(localizer, named, calibration.camera, bar.update)

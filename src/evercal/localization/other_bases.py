@@ -19,7 +19,7 @@ from evercal.localization.query import Candidate, Query
 from evercal.localization.scene_poses import ScenePoses
 from evercal.mapping.scene_map import SceneMap, base_from_other_base, same_base
 
-FAR_BETTER = 0.4
+FAR_BETTER = 0.6
 """An image excludes a scene whose inlier ratio is below this share of that in another one."""
 FEW = 60
 """Landmarks that should be visible; with fewer of them an image excludes no scene."""

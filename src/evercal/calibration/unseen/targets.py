@@ -47,6 +47,8 @@ def scene_target(located: Sequence[ImagePose]) -> Target:
     """The scene in which images were located."""
     views = {}
     for item in located:
+        if len({*item.estimate.alternatives_in}) > 1:
+            raise InputError(f"{item.name}: {item.estimate.reason}")
         if item.is_located and item.estimate.points_m is not None:
             pose = UncertainPose(item.pose, item.covariance).inverse()
             views[item.name] = TargetView(pose, item.estimate.points_m)
