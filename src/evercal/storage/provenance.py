@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 from evercal.classes import frozen
 from evercal.errors import without_secrets
@@ -110,19 +110,23 @@ def recorded() -> JsonObject:
     return {"made": asdict(made)} if made else {}
 
 
-class _Written(NamedTuple):
+class _Checksum:
     """A file whose content only goes into a checksum: images in memory are not copied."""
 
-    write: Callable[[Any], None]
+    def __init__(self) -> None:
+        self.sha256 = hashlib.sha256()
+
+    def write(self, data: Any) -> None:
+        """Add bytes."""
+        self.sha256.update(data)
 
 
 def _inputs(name: str, value: Any) -> dict[str, str]:
     """What an argument gives: files, those of folders and lists by their endings, or values."""
     if is_dataclass(value):
-        digest = hashlib.sha256()
-        pickler = pickle.Pickler(_Written(digest.update), protocol=5)
-        pickler.dump(value)
-        return {name: f"sha256 {digest.hexdigest()}"}
+        file = _Checksum()
+        pickle.dump(value, file, protocol=5)
+        return {name: f"sha256 {file.sha256.hexdigest()}"}
     paths = []
     for item in value if isinstance(value, list | tuple) else [value]:
         if isinstance(item, Path) or (isinstance(item, str) and name in _PATHS):
