@@ -20,7 +20,7 @@ def test_a_pose_where_the_map_locates_its_image_is_not_called_wrong(
     hall: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Frames that are set aside are not in the map, and so not accused.
-    right, wrong = (split_held_out(hall.train, spread=True).train[i] for i in (3, 5))
+    right, wrong = (split_held_out(hall.train).train[i] for i in (3, 5))
     frames = [*hall.train]
     pose = wrong.base_from_camera
     assert pose is not None

@@ -23,20 +23,3 @@ def test_held_out_frames_are_blocks_of_four(count: int) -> None:
     assert (np.diff(blocks[:, 0]) > 4).all()
     assert blocks.min() > 0
     assert blocks.max() < count - 1
-
-
-@pytest.mark.parametrize("count", [16, 17, 25, 60, 91, 99, 100, 101, 150, 199, 200])
-def test_single_frames_of_a_short_recording_are_spread(count: int) -> None:
-    image = np.zeros((3, 4, 3), np.uint8)
-    frames = [Frame(f"{i:06d}", image, CAMERA, None) for i in range(count)]
-    split = split_held_out(frames, spread=True)
-    assert split.train == tuple(f for f in frames if f not in split.held_out)
-    numbers = np.array([int(frame.name) for frame in split.held_out])
-    assert max(4, count // 25) <= len(numbers) <= max(4, count // 25) + 1
-    if count >= 200:  # a video
-        assert split == split_held_out(frames)
-        return
-    assert np.ptp(np.diff(numbers)) == 0
-    assert numbers[0] > 0
-    assert numbers[-1] < count - 1
-    assert numbers[-1] - numbers[0] >= count / 2

@@ -48,6 +48,6 @@ def learn_scene(
         )
     recording = posed_recording(recording)
     require_frames(recording)
-    split = split_held_out(recording.train, spread=True)
+    split = split_held_out(recording.train)
     learned = learn_posed(recording, split, contents, budget, options, on_progress)
     return learned.scene, learned.report(contents, began)

@@ -42,7 +42,7 @@ def learn_wrist(
     """
     began = time.perf_counter()
     posed, start = _posed_by_gripper(recording, contents, on_progress)
-    split = split_held_out(posed.train, spread=True)
+    split = split_held_out(posed.train)
     if len(split.held_out) < LEAST_ANSWERS:
         split = HeldOutSplit(posed.train, ())
     budget = replace(budget, least=MIN_GRIPPER_FRAMES)

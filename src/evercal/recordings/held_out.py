@@ -24,28 +24,24 @@ class HeldOutSplit:
 
     train: tuple[Frame, ...]
     held_out: tuple[Frame, ...]
-    """Frames that the scatter of the stated poses is fitted to: 4 in every 100, and at least 4. A
-    recording with fewer than `MIN_TRAIN_FRAMES` frames has none."""
+    """Frames that the scatter of the stated poses is fitted to: 4 consecutive ones in every 100,
+    and at least 4. A recording with fewer than `MIN_TRAIN_FRAMES` frames has none."""
 
 
-def split_held_out(frames: Sequence[Frame], spread: bool = False) -> HeldOutSplit:
+def split_held_out(frames: Sequence[Frame]) -> HeldOutSplit:
     """Hold out blocks of training frames, in recorded order.
 
-    Neighbours in a video share their errors. With `spread`, single frames of a recording with less
-    than two blocks are held out, as often.
+    Neighbours in a video share their errors. Single frames that are spread over a short recording
+    make no better map (research/trust.md).
     """
     if len(frames) < MIN_TRAIN_FRAMES:
         return HeldOutSplit(tuple(frames), ())
-    block = BLOCK
     every = min(EVERY, len(frames))
-    if spread and len(frames) < 2 * EVERY:
-        block = 1
-        every //= BLOCK
     middle = every // 2
     train = []
     held_out = []
     for i, frame in enumerate(frames):
-        if middle <= i % every < middle + block:
+        if middle <= i % every < middle + BLOCK:
             held_out.append(frame)
         else:
             train.append(frame)
