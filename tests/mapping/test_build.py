@@ -204,6 +204,7 @@ def test_landmarks_are_tracked_again_after_noticeable_changes(
         lens_systematic=np.zeros((14, 14)),
         correction=zero[:, 0],
         errors=zero[:, 0],
+        left_out=zero[:, 0],
         weight=np.ones(10),
         covariance=zero,
         inverse_depth=np.full(7, 0.5),
@@ -329,7 +330,8 @@ def test_parts_are_left_out_with_the_keyframes_near_them(
     assert built.left_out(frames[:29]) == []
     none: dict[str, np.ndarray] = {}
     start = SE3.identity()
-    moved = HandEyeCorrection(start, *[np.eye(6)] * 3, none, none, none)
+    one = np.eye(6)
+    moved = HandEyeCorrection(start, one, one, one, none, none, none)
     assert replace(built, hand_eye=moved).left_out(frames) == []
 
 

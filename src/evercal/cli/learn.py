@@ -313,9 +313,10 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
         if other.same_base:
             yield other.agreement
     for name, error in [*report.set_aside.items()][:MOST_LINES]:
-        how = "not located"
+        how = "not aligned"
         if error:
-            how = "located {:.2f} mm, {:.3f} deg from its stated pose".format(*error)
+            parts = ["{:.2f} mm", "{:.3f} deg"][-len(error) :]
+            how = f"aligned {', '.join(parts).format(*error)} from its stated pose"
         yield f"  set aside    {name}: {how}"
     yield from map("warning: {}".format, report.warnings)
     found = report.hand_eye

@@ -187,6 +187,8 @@ class Map:
     Example: evercal map list cell.evercal
     """
 
+    writes = ()
+    """See `args.Verb`."""
     action: OmitSubcommandPrefixes[
         Annotated[List, subcommand("list")]
         | Annotated[Remove, subcommand("remove")]

@@ -87,10 +87,10 @@ class Verify(args.Verb):
         camera = calibration.camera
         lines = []
         if self.picks is not None:
-            touches = self._touches()
             if self.pick:
-                self._pick(touches, self.picks)
+                self._pick(self._touches(), self.picks)
             picks, grippers = self._picked(calibration, self.picks)
+            touches = self._touches()
             data = touched_data(calibration, touches, picks, grippers, self.pick_px)
         else:
             target, grippers = self._target(calibration)

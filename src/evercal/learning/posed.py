@@ -6,12 +6,11 @@ from dataclasses import field, replace
 
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
-from evercal.geometry import pose_distance_mm_deg
 from evercal.learning.report import LearnReport
 from evercal.learning.stated_scatter import (
+    held_out_errors,
     localizer_of,
     located_as_stated,
-    located_poses,
     with_scatter,
 )
 from evercal.mapping.build import MapOptions, build_map
@@ -90,12 +89,9 @@ def learn_posed(
         noise=built.independent_noise,
     )
     built = cleared(built, scene, split.train, contents)
-    poses = located_poses(localizer_of(contents, scene), held_out)
-    errors = {}
-    for frame, pose in zip(held_out, poses, strict=True):
-        errors[frame.name] = ()
-        if pose is not None and frame.base_from_camera is not None:
-            errors[frame.name] = pose_distance_mm_deg(pose, frame.base_from_camera)
+    errors = held_out_errors(contents.empty().with_scene(scene), held_out)
+    if not recording.metric:
+        errors = {name: error[1:] for name, error in errors.items()}
     return LearnedScene(scene, built, split, recording.metric, errors)
 
 

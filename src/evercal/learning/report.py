@@ -61,8 +61,8 @@ class LearnReport:
     held_out_frames: int
     """Frames that the scatter of the stated poses was fitted to."""
     set_aside: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    """Distances of these frames, located in the map, from their stated poses, millimetres in the
-    unit of the recording and degrees: an independent check. Empty of one that is not located."""
+    """Distances of these frames, aligned in the map, from their stated poses, millimetres (unless
+    the unit is unknown) and degrees: an independent check. Empty of one that is not aligned."""
     landmarks: int = 0
     """Landmarks of this scene."""
     adjusted: Adjusted | None = None

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evercal.geometry import SE3, Camera
+from evercal.geometry import SE3, Camera, pose_distance_mm_deg
 from evercal.localization.answer import differ, in_base
 from evercal.localization.hypothesis import Aligned
 from evercal.localization.intrinsics import (
@@ -111,6 +111,24 @@ def with_scatter(
     radians = scatter(errors[:, 3:], covariances[:, 3:, 3:])
     sigma = (max(known_metres, metres), max(known_radians, radians))
     return replace(scene, frame=replace(scene.frame, frame_sigma=sigma))
+
+
+def held_out_errors(
+    contents: MapContents, held_out: Sequence[Frame]
+) -> dict[str, tuple[float, ...]]:
+    """Distances of frames, aligned in the newest scene, from their stated poses, by name.
+
+    Millimetres and degrees; nothing of a frame that is not aligned.
+    """
+    scene = contents.scenes[-1]
+    part = LeftOut(tuple(held_out), np.arange(len(scene.keyframes)))
+    errors: dict[str, tuple[float, ...]] = {frame.name: () for frame in held_out}
+    for frame, aligned in _aligned(contents, scene, [part], CERTAINLY_OWN):
+        stated = frame.base_from_camera
+        if stated is not None:
+            estimate, _ = in_base(aligned, scene)
+            errors[frame.name] = pose_distance_mm_deg(estimate.pose, stated)
+    return errors
 
 
 def _aligned(

@@ -19,7 +19,7 @@ from evercal.localization.query import Candidate, Query
 from evercal.localization.scene_poses import ScenePoses
 from evercal.mapping.scene_map import SceneMap, base_from_other_base, same_base
 
-FAR_BETTER = 0.6
+FAR_BETTER = 0.5
 """An image excludes a scene whose inlier ratio is below this share of that in another one."""
 FEW = 60
 """Landmarks that should be visible; with fewer of them an image excludes no scene."""
@@ -57,9 +57,12 @@ def in_other_base(
     The second one is None if the image excludes it, or if no scene is in another base.
     """
     scenes = poses.contents.scenes
+    others = sorted(poses.bank.scenes - {best.scene})
+    if not others:
+        return best, None
     own = InBase.of(scenes[best.scene], best)
     views = [own]
-    for number in sorted(poses.bank.scenes):
+    for number in others:
         scene = scenes[number]
         between = base_from_other_base(scene, own.scene)
         if between is not None and not same_base(scene, own.scene):

@@ -112,7 +112,9 @@ class RobotModel:
             self._refuse_degrees(name, column, source)
         for name, column in zip(arm.joints, values.T, strict=True):
             notes += self._beyond_limits(name, column)
-        frames = FrameNames(base, gripper)
+        frames = FrameNames(base)
+        if gripper != base:
+            frames = FrameNames(base, gripper)
         return ArmPoses(arm.poses(values), arm, values, notes, frames)
 
     def arm(self, base: str, gripper: str) -> Arm:

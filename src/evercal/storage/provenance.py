@@ -125,7 +125,10 @@ def _inputs(name: str, value: Any) -> dict[str, str]:
     """What an argument gives: files, those of folders and lists by their endings, or values."""
     if is_dataclass(value):
         file = _Checksum()
-        pickle.dump(value, file, protocol=5)
+        try:
+            pickle.dump(value, file, protocol=5)
+        except TypeError:  # images of an open bag or video
+            return {name: type(value).__name__}
         return {name: f"sha256 {file.sha256.hexdigest()}"}
     paths = []
     for item in value if isinstance(value, list | tuple) else [value]:

@@ -156,6 +156,7 @@ class _MapRun(_Run):
                 size = memory.bytes or f"{100 * memory.share:g}%"
                 scene, report = learn_scene(self.scenes[number], contents, size)
                 opened.commit(scene, report.to_dict())
+                contents = opened.contents
             name = self.strategy.name
             named = {
                 name: Localizer(contents),

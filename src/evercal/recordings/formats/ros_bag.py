@@ -111,6 +111,9 @@ def load(root: Path, options: ReadOptions) -> Recording:
         )
     notes += poses.notes
     stated = poses.stated
+    names = stated.frames
+    if camera_frame not in (names.base, names.gripper):
+        names = replace(names, camera=camera_frame)
     return Recording(
         root.resolve().stem,
         tuple(frames),
@@ -118,7 +121,7 @@ def load(root: Path, options: ReadOptions) -> Recording:
         lost,
         notes=tuple(notes),
         arm=stated.arm,
-        frames=replace(stated.frames, camera=camera_frame),
+        frames=names,
     )
 
 
