@@ -71,11 +71,11 @@ def tuned(spdd: float) -> dict[str, Strategy]:
 class Experiment(Bench):
     """`evercal bench` with given strategies."""
 
-    given: tuple[Strategy, ...] = ()
+    compared: tuple[Strategy, ...] = ()
     """Strategies, the first of which the others are compared with."""
 
     def _strategies(self) -> tuple[Strategy, ...]:
-        return self.given
+        return self.compared
 
 
 def chosen(names: Sequence[str], known: Mapping[str, Strategy]) -> tuple[Strategy, ...]:
@@ -98,7 +98,7 @@ def experiments(
             order="balanced",
             preset="converged",
             seeds=seeds,
-            given=chosen(names, ours),
+            compared=chosen(names, ours),
             device=device,
         )
 
@@ -118,15 +118,17 @@ def experiments(
     return {
         "gate": [gate],
         "a": [
-            replace(gate, given=chosen(every, ours)),
-            replace(gate, given=chosen(CONTRASTS, ours), seeds=MORE_SEEDS),
+            replace(gate, compared=chosen(every, ours)),
+            replace(gate, compared=chosen(CONTRASTS, ours), seeds=MORE_SEEDS),
         ],
         "memory": memory,
-        "b": [head, replace(head, given=tuned_head)],
-        "c": [unseen, replace(unseen, given=chosen(["evercal"], ours), seeds="0")],
+        "b": [head, replace(head, chosen=tuned_head)],
+        "c": [unseen, replace(unseen, compared=chosen(["evercal"], ours), seeds="0")],
         "real": [replace(real, steps=2 * STEPS)],
         "paper": [
-            replace(paper, preset="paper", order=Bench.order, given=chosen(PAPER, {}))
+            replace(
+                paper, preset="paper", order=Bench.order, compared=chosen(PAPER, {})
+            )
         ],
     }
 

@@ -49,7 +49,7 @@ class Case(NamedTuple):
     """One kind of data."""
 
     kind: str
-    count: int
+    number: int
     moves: bool
     """Whether the camera is on the gripper."""
 
@@ -83,7 +83,7 @@ def run(out: Path = Path("runs/verify"), draws: int = 200) -> None:
     for case in CASES:
         seeds = range(FIRST_SEED, FIRST_SEED + draws)
         row = once(
-            out / f"{case.kind}-{case.count}-{case.moves}.json",
+            out / f"{case.kind}-{case.number}-{case.moves}.json",
             lambda c=case, s=seeds: _summary(c, [_tried(c, seed) for seed in s]),
         )
         rows.append(row)
@@ -133,12 +133,12 @@ def _noisy(trial: Trial, poses: SE3) -> SE3:
 def _points(case: Case, trial: Trial) -> Data:
     rng = trial.rng
     camera = trial.cell.intrinsics
-    names = [f"p{i}" for i in range(case.count)]
+    names = [f"p{i}" for i in range(case.number)]
     area = np.array([0.15, 0.15, 0.05])
-    poses = trial.cell.reachable_poses(4 * case.count, trial.cell.seed + 1)
+    poses = trial.cell.reachable_poses(4 * case.number, trial.cell.seed + 1)
     points = []
     stated = []
-    while len(points) < case.count:
+    while len(points) < case.number:
         point = WORK_AREA_M + rng.uniform(-1, 1, 3) * area
         pose = poses[rng.integers(len(poses))]
         view = pose @ trial.true if case.moves else trial.true
@@ -156,7 +156,7 @@ def _points(case: Case, trial: Trial) -> Data:
         touched += [f"{names[0]}#{i}" for i in (2, 3, 4)]
     turns = np.zeros((len(touched), 6))
     turns[:, 3:] = rng.uniform(-0.2, 0.2, (len(touched), 3))
-    turns[case.count :, 3:] += TILTS[: len(touched) - case.count]
+    turns[case.number :, 3:] += TILTS[: len(touched) - case.number]
     rotated = down @ SE3.exp(turns)
     tips = np.r_[points, np.repeat(points[:1], len(touched) - len(names), 0)]
     tips = tips + rng.normal(0, TOUCH_M, tips.shape)
@@ -184,7 +184,7 @@ def _board(case: Case, trial: Trial) -> Data:
 
     rng = trial.rng
     cell = trial.cell
-    count = case.count
+    count = case.number
     seed = trial.cell.seed + 1
     if case.moves:
         stated = cell.reachable_poses(count, seed)
@@ -224,7 +224,7 @@ def _summary(case: Case, found: Sequence[tuple[float, ...]]) -> Row:
     factor = np.quantile(np.abs(np.log(measured / true)), 0.9)
     return {
         "data": case.kind,
-        "number": case.count,
+        "number": case.number,
         "camera": "gripper" if case.moves else "fixed",
         "good, accused %": float(100 * accused[good].mean()),
         "good, no answer %": float(100 * (verdict[good] == 1).mean()),

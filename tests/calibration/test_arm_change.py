@@ -33,7 +33,7 @@ def calibration(
             zip(names, offsets_deg, np.diag(covariance), strict=True)
         )
     )
-    eye = SE3.identity(), 1e-8 * np.eye(6), "gripper"
+    eye = SE3.identity(), 1e-8 * np.eye(6)
     return Calibration("eye_in_hand", *eye, joints=joints, joint_covariance=covariance)
 
 
