@@ -122,7 +122,7 @@ def experiments(
             replace(gate, compared=chosen(CONTRASTS, ours), seeds=MORE_SEEDS),
         ],
         "memory": memory,
-        "b": [head, replace(head, chosen=tuned_head)],
+        "b": [head, replace(head, compared=tuned_head)],
         "c": [unseen, replace(unseen, compared=chosen(["evercal"], ours), seeds="0")],
         "real": [replace(real, steps=2 * STEPS)],
         "paper": [
