@@ -221,7 +221,7 @@ class Learn(args.Verb):
         self, recording: "Recording", report: "LearnReport", path: Path
     ) -> Sequence[object]:
         if report.hand_eye is not None:
-            file = self.calibration or self.store
+            file = self.calibration or f"{self.store}:{report.scene}"
             return args.next_words(report.hand_eye.calibration, file)
         if not recording.metric:
             images = ("IMAGE...", "--robot-poses", "FILE")
