@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from evercal.geometry import SE3, pose_distance
 from evercal.localization.localizer import Localizer
 from evercal.mapping.build import MapOptions
 from evercal.mapping.scene_map import base_from_other_base
-from evercal.mapping.store import MapStore
+from evercal.mapping.store import MapStore, read_scene
 from evercal.recordings.frame import Frame, Recording
 
 QUICK = MapOptions(adjust=False)
@@ -108,6 +109,22 @@ def test_scenes_that_are_stored_keep_their_places(two_bases: Map) -> None:
     metres, radians = pose_distance(between, MOVED)
     assert metres < 0.03
     assert radians < 0.03
+
+
+def test_a_scene_that_an_earlier_version_wrote_is_in_a_place_of_its_own(
+    arc: Recording, tmp_path: Path
+) -> None:
+    cell = small_map(tmp_path / "map")
+    cell.learn(arc, options=QUICK)
+    (folder,) = (cell.path / "stages").iterdir()
+    content = json.loads((folder / "scene.json").read_text())
+    del content["places"]
+    (folder / "scene.json").write_text(json.dumps(content))
+    old = read_scene(folder)
+    moved = replace(old, name="moved", places={old.digest: MOVED})
+    between = base_from_other_base(moved, old)
+    assert between is not None
+    assert max(pose_distance(between, MOVED.inverse())) < 1e-9
 
 
 @pytest.mark.parametrize("base", ["", "left"])

@@ -6,7 +6,6 @@ causes are those of a mixture: all errs as stated, or one cause by more.
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from datetime import UTC, datetime
 from typing import Literal
 
 import numpy as np
@@ -17,6 +16,7 @@ from evercal.calibration.framed_pose import FramedPose
 from evercal.classes import frozen
 from evercal.geometry import norms
 from evercal.robot.pose_errors import ArmErrors
+from evercal.storage.provenance import now
 from evercal.typing import Array, JsonObject
 
 Verdict = Literal["honest", "not as stated", "cannot tell"]
@@ -148,7 +148,7 @@ def judge(
         factor,
         causes,
         data.misses_m,
-        datetime.now(UTC).isoformat(timespec="seconds"),
+        now(),
     )
 
 

@@ -1,6 +1,6 @@
 """Whether the place of a new scene is mapped already, and where the other scene has its base."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -80,12 +80,12 @@ def placed(
                 " base (`base`)"
             )
         others.append(record)
-        for place, place_from_other in _places(other.scene).items():
+        for place, place_from_other in other.scene.places.items():
             pose = place_from_other
             if not other.same:
                 pose = place_from_other @ other.other_from_base
             places.setdefault(place, pose)
-    return replace(scene, places=places or _places(scene)), tuple(others)
+    return replace(scene, places=places or scene.own_place), tuple(others)
 
 
 def _mapped_already(contents: MapContents, scene: SceneMap) -> list[_Relation]:
@@ -99,7 +99,7 @@ def _mapped_already(contents: MapContents, scene: SceneMap) -> list[_Relation]:
         estimate = localizer.localize(*view.image)
         shown.update(estimate.alternatives_in)
         shown.update([estimate.scene] if estimate.scene else [])
-    places = {place for name in shown for place in _places(contents.scene(name))}
+    places = {place for name in shown for place in contents.scene(name).places}
     found = []
     for other in contents.scenes:
         near = other.name in shown or places & other.places.keys()
@@ -107,11 +107,6 @@ def _mapped_already(contents: MapContents, scene: SceneMap) -> list[_Relation]:
             relation = _relation(localizer.within([other.name]), scene, other)
             found += [] if relation is None else [relation]
     return found
-
-
-def _places(scene: SceneMap) -> Mapping[str, SE3]:
-    """place_from_base by place; maps that earlier versions wrote are in a place of their own."""
-    return scene.places or {scene.digest: SE3.identity()}
 
 
 class _View(NamedTuple):

@@ -87,6 +87,11 @@ class SceneMap:
             digest.update(np.float64(similarity.scale).tobytes())
         return digest.hexdigest()[:16]
 
+    @property
+    def own_place(self) -> dict[str, SE3]:
+        """`places` of a scene that is the first one to map its place."""
+        return {self.digest: SE3.identity()}
+
 
 def base_from_other_base(scene: SceneMap, other: SceneMap) -> SE3 | None:
     """Pose of another scene's base in the base of a scene; None if they share no place."""

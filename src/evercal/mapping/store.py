@@ -10,6 +10,7 @@ stages/0001-NAME/
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
@@ -324,7 +325,7 @@ def _read_scene(folder: Path) -> SceneMap:
     arrays = open_tensors(folder / KEYFRAMES)
     keyframes = Keyframes.from_tensors(arrays)
     require_landmarks(arrays, keyframes.cameras)
-    return SceneMap(
+    scene = SceneMap(
         name=checked_name(content["name"]),
         camera=Camera.from_dict(content["camera"]),
         adjusted_camera=Camera.from_dict(content["adjusted_camera"]),
@@ -341,3 +342,6 @@ def _read_scene(folder: Path) -> SceneMap:
             for place, pose in content.get("places", {}).items()
         },
     )
+    if not scene.places:
+        return replace(scene, places=scene.own_place)
+    return scene
