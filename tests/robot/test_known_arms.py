@@ -49,7 +49,9 @@ def test_the_table_is_plain_json() -> None:
 def test_the_page_lists_the_table() -> None:
     page = (Path(__file__).parents[2] / "docs" / "arms.md").read_text("utf-8")
     rows = re.findall(r"^\| .+ \| (.+) \| (`.+) \| .+ \| .+ \|$", page, re.M)
-    listed = [(name, kind) for kind, cell in rows for name in re.findall("`(.+?)`", cell)]
+    listed = [
+        (name, kind) for kind, cell in rows for name in re.findall("`(.+?)`", cell)
+    ]
     assert sorted(listed) == sorted(ARM_NAMES.items())
     assert f"the kinematics of {len(listed)} arms" in page
 
