@@ -273,12 +273,8 @@ TABLES: dict[str, Callable[[], Table]] = {
     "results: degraded images": _degraded,
     "results: wrong training poses": _bad_poses,
     "results: fixed cameras": _fixed,
-    "results: another camera of the model": _rows(
-        "answer,camera,stated,answers,located,median_mm,95_%_mm,inside_95_%,wrong",
-        "same-model",
-    ),
     "map: PnP": _rows("matches,outliers,solver,right_%,median_mm,ms", "pnp"),
-    "results: speed": _rows("what,beside,now,ratio", "speed"),
+    "speed: both versions": _rows("what,beside,now,ratio", "speed"),
     "speed: AVX2": _rows("what,beside,now,ratio", "speed-avx2"),
     "boards: solvers": lambda: _rows(
         "condition,median_mm,p95_mm,inside_95,size_flagged,ms,Park_mm,Daniilidis_mm,"
