@@ -26,7 +26,8 @@ from evercal.recordings.poses.joint_tables import read_joints
 from .checks import assert_pose
 
 PAGE = Path(__file__).parents[2] / "docs" / "formats.md"
-EXAMPLES = dict(re.findall(r"^```\w+ (\S+)\n(.*?)^```$", PAGE.read_text(), re.M | re.S))
+TEXT = PAGE.read_text() + Path(__file__).with_name("more_examples.md").read_text()
+EXAMPLES = dict(re.findall(r"^```\w+ (\S+)\n(.*?)^```$", TEXT, re.M | re.S))
 CAMERA = Camera(640, 480, 525.2, 526.5, 319.5, 239.3, (0.1, -0.02, 0.001, 0.0, 0.03))
 POSES = SE3(
     np.array([[0, 1, 0, 0], [0.0998, 0.995, 0, 0]]),
@@ -86,7 +87,7 @@ def page(tmp_path: Path) -> Path:
 
 
 def test_every_example_is_read_here() -> None:
-    assert PAGE.read_text().count("```") == 2 * len(EXAMPLES)
+    assert TEXT.count("```") == 2 * len(EXAMPLES)
     files = SINGLE_FILES | CAMERAS | CHAINS | POSE_FILES.keys()
     assert {name.split("/")[0] for name in EXAMPLES if name not in files} == set(
         RECORDINGS
