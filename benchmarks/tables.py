@@ -300,17 +300,18 @@ TABLES: dict[str, Callable[[], Table]] = {
         "inside_95,fixed_mm,fixed_deg,fixed_inside_95,offset_deg,offset_inside_95,offset_squared",
         "joint-offsets",
     ),
-    "scale: retrieval": _rows(
-        "queries,keyframes,images,first,proposed,one_image_ms,four_turns_ms,before_ms,megabytes",
-        "retrieval",
-    ),
+    "scale: retrieval": lambda: _rows(
+        "queries,keyframes,first,proposed,four_turns_ms,megabytes", "retrieval"
+    )().query("queries == 'box rooms'"),
     "scale: maps": _rows(
         "scenes,open_s,own_mb,images,right,wrong,median_ms", "large-maps"
     ),
-    "scale: cluster": _rows(
-        "way,wall_s,processor_s,killed,same_map,images_per_s,median_ms,processor_ms,same_answers",
-        "cluster",
-    ),
+    "scale: learning on a cluster": lambda: _rows(
+        "way,wall_s,processor_s,killed,same_map", "cluster"
+    )().query("`wall s` != ''"),
+    "scale: serving from a cluster": lambda: _rows(
+        "way,images_per_s,median_ms,processor_ms,same_answers", "cluster"
+    )().query("`median ms` != ''"),
     "fisheye: lenses": _rows(
         "answer,rooms,map,asked,number,located,mm,mm_90,inside_95,wrong", "fisheye"
     ),
