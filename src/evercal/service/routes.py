@@ -13,16 +13,15 @@ from fastapi import (
     Query,
     Request,
     Response,
-    UploadFile,
     WebSocket,
 )
-from fastapi.responses import JSONResponse, PlainTextResponse, RedirectResponse
+from fastapi.responses import JSONResponse, RedirectResponse
 from prometheus_client import generate_latest
+from pydantic.json_schema import SkipJsonSchema
 from starlette.requests import HTTPConnection
 
 from evercal.bounds import RequestBounds
-from evercal.calibration import drift
-from evercal.calibration.from_images import calibrate
+from evercal.calibration import drift, from_images
 from evercal.calibration.image_source import Images
 from evercal.classes import frozen
 from evercal.errors import InputError
@@ -41,22 +40,41 @@ from evercal.service.limits import (
     poses_of,
 )
 from evercal.service.live_map import LiveMap
+from evercal.service.schemas import (
+    IMAGES,
+    SERVICE,
+    CalibrationFile,
+    CameraShift,
+    Estimate,
+    Health,
+    Problem,
+    SceneNames,
+    Upload,
+)
 from evercal.service.stream import Frame, Stream
 from evercal.typing import Strings
 
-router = APIRouter()
+router = APIRouter(
+    generate_unique_id_function=lambda route: route.name,
+    responses={"4XX": {"model": Problem}, "5XX": {"model": Problem}},
+)
+OptionalFile = Upload | SkipJsonSchema[None]
 CameraFile = Annotated[
-    UploadFile | None,
+    OptionalFile,
     File(description="Intrinsics: JSON, YAML or a 3x3 matrix as text."),
 ]
 PosesFile = Annotated[
-    UploadFile | None,
+    OptionalFile,
     File(description="base_from_gripper of every image: a table as text, or JSON."),
 ]
 Scenes = Annotated[
-    Strings, Form(description="Names of scenes; others are not considered.")
+    Strings,
+    Form(
+        default_factory=tuple,
+        description="Names of scenes; others are not considered.",
+    ),
 ]
-Shots = Annotated[list[UploadFile], File(description="Image files, all of one camera.")]
+Shots = Annotated[list[Upload], File(description="Image files, all of one camera.")]
 _NAME = 100
 """Characters of a file name that are kept."""
 
@@ -103,7 +121,12 @@ async def index() -> Response:
     return RedirectResponse("docs")
 
 
-@router.get("/health")
+@router.get(
+    "/health",
+    tags=[SERVICE],
+    response_model=Health,
+    responses={503: {"model": Health, "description": "The map cannot be read."}},
+)
 async def health(service: Asked) -> JSONResponse:
     """Whether the service answers, and whether it can read the map."""
     scenes = len(service.live.current.scenes)
@@ -117,20 +140,25 @@ async def health(service: Asked) -> JSONResponse:
     return JSONResponse(content, status)
 
 
-@router.get("/scenes")
-async def scenes(service: Asked) -> dict[str, Any]:
+@router.get("/scenes", tags=[SERVICE], response_model=SceneNames)
+async def scenes(service: Asked) -> JSONResponse:
     """Names of the scenes, in order of learning."""
-    return {"scenes": list(service.live.current.scenes)}
+    return JSONResponse({"scenes": service.live.current.scenes})
 
 
-@router.post("/localize", dependencies=[form("image", "camera", "scene")])
+@router.post(
+    "/localize",
+    tags=[IMAGES],
+    response_model=Estimate,
+    dependencies=[form("image", "camera", "scene")],
+)
 async def localize(
     service: Asked,
     request: Request,
-    image: UploadFile,
+    image: Annotated[Upload, File(description="An image file.")],
+    scene: Scenes,
     camera: CameraFile = None,
-    scene: Scenes = (),
-) -> dict[str, Any]:
+) -> JSONResponse:
     """Estimate the camera pose of one image: the row of `evercal localize --json`."""
     name = _name(image, "image")
     data = await image.read()
@@ -149,7 +177,7 @@ async def localize(
 
     row = await service.desk.run(work, request)
     service.metrics.answers.labels(row["status"]).inc()
-    return row
+    return JSONResponse(row)
 
 
 async def _decode(
@@ -183,37 +211,45 @@ Decode = Annotated[Callable[[Check], Images], Depends(_decode)]
 
 @router.post(
     "/calibrations",
+    tags=[IMAGES],
+    response_model=CalibrationFile,
     dependencies=[form("camera", "robot_poses", "mount", "scene", "images")],
 )
-async def calibrations(
+async def calibrate(
     service: Asked,
     request: Request,
     decode: Decode,
-    mount: Annotated[MountName | None, Form()] = None,
-    scene: Scenes = (),
-) -> dict[str, Any]:
+    scene: Scenes,
+    mount: Annotated[
+        MountName | SkipJsonSchema[None],
+        Form(description="Beside the arm or on the gripper; else by the images."),
+    ] = None,
+) -> JSONResponse:
     """Calibrate a camera from its images: the calibration file."""
 
     def work(check: Check) -> dict[str, Any]:
         given = decode(check)
-        return calibrate(service.live.within(scene), given, mount).to_dict()
+        scenes = service.live.within(scene)
+        return from_images.calibrate(scenes, given, mount).to_dict()
 
-    return await service.desk.run(work, request)
+    return JSONResponse(await service.desk.run(work, request))
 
 
 @router.post(
     "/check",
+    tags=[IMAGES],
+    response_model=CameraShift,
     dependencies=[form("camera", "robot_poses", "calibration", "scene", "images")],
 )
 async def check(
     service: Asked,
     request: Request,
     decode: Decode,
+    scene: Scenes,
     calibration: Annotated[
-        UploadFile, File(description="The calibration file of the camera.")
+        Upload, File(description="The calibration file of the camera.")
     ],
-    scene: Scenes = (),
-) -> dict[str, Any]:
+) -> JSONResponse:
     """Test whether a fixed camera has moved: the object of `evercal check --json`."""
     content = await calibration.read()
 
@@ -229,20 +265,25 @@ async def check(
         )
         return check_record(shift)
 
-    return await service.desk.run(work, request)
+    return JSONResponse(await service.desk.run(work, request))
 
 
-def _name(file: UploadFile, default: str) -> str:
+def _name(file: Upload, default: str) -> str:
     return (file.filename or default)[-_NAME:]
 
 
-async def _content(file: UploadFile | None) -> bytes | None:
+async def _content(file: Upload | None) -> bytes | None:
     if file is None:
         return None
     return await file.read()
 
 
-@router.get("/metrics", response_class=PlainTextResponse)
+@router.get(
+    "/metrics",
+    tags=[SERVICE],
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
+)
 async def metrics(service: Asked) -> Response:
     """Counters for Prometheus."""
     service.metrics.scenes.set(len(service.live.current.scenes))

@@ -26,6 +26,7 @@ from evercal.service.connection import protocols
 from evercal.service.desk import Desk
 from evercal.service.guard import PAGES, Guard, Metrics
 from evercal.service.live_map import LiveMap
+from evercal.service.schemas import DESCRIPTION, TAGS
 
 POLL_S = 0.5
 """Interval of the search for changes that other processes make to the map."""
@@ -78,7 +79,13 @@ def make_app(
             desk.close()
 
     app = FastAPI(
-        title="evercal", version="1", docs_url=None, redoc_url=None, lifespan=lifespan
+        title="evercal",
+        version="1",
+        description=DESCRIPTION,
+        openapi_tags=TAGS,
+        docs_url=None,
+        redoc_url=None,
+        lifespan=lifespan,
     )
     # Only for the page, which then can send the token; the guard compares it.
     bearer = [Security(HTTPBearer(auto_error=False))] if options.token else []
@@ -93,9 +100,14 @@ def make_app(
     return app
 
 
+_DARK = """<script>
+document.documentElement.classList.toggle("dark-mode", matchMedia("(prefers-color-scheme: dark)").matches)
+</script></head>"""
+
+
 def _page() -> HTMLResponse:
     files = PAGES.lstrip("/")
-    return get_swagger_ui_html(
+    page = get_swagger_ui_html(
         openapi_url="openapi.json",
         title="evercal",
         swagger_js_url=f"{files}swagger-ui-bundle.js",
@@ -103,6 +115,7 @@ def _page() -> HTMLResponse:
         swagger_favicon_url=f"{files}favicon-32x32.png",
         swagger_ui_parameters={"tryItOutEnabled": True},
     )
+    return HTMLResponse(page.body.decode().replace("</head>", _DARK))
 
 
 async def _poll(live: LiveMap) -> None:
