@@ -153,8 +153,11 @@ def require_at_most(count: int, name: str, what: str) -> None:
     """Raise ValueError if there is more of `what` than the bound of this name allows."""
     most = getattr(bounds(), name)
     if count > most:
+        remedy = "add `limits`"
+        if _of_request.get():
+            remedy = "whoever runs the service can raise it by --limits"
         raise ValueError(
-            f"{count:,} {what}, at most {most:,} are read; if it is right, add `limits`"
+            f"{count:,} {what}, at most {most:,} are read; if it is right, {remedy}"
             f" {name}={count}"
         )
 

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import re
+import runpy
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -100,3 +105,15 @@ def test_a_token_is_sent(serve, hall_store, image):
         assert Client(service.url, token).localize(image).status == "ok"
         with pytest.raises(InputError, match="send 'Authorization: Bearer TOKEN'"):
             Client(service.url).localize(image)
+
+
+def test_the_example_asks_a_service(cell, monkeypatch, capsys):
+    root = Path(__file__).parents[2]
+    folders = [str(root / "src"), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(folders))
+    script = str(root / "examples" / "08_http.py")
+    monkeypatch.setattr(sys, "argv", [script, str(cell / "cell.evercal")])
+    runpy.run_path(script, run_name="__main__")
+    first, *_, last = capsys.readouterr().out.splitlines()
+    assert first.startswith("ok: SE3(")
+    assert re.fullmatch(r"moved: True, [45]\.\d mm", last)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from typing import Any
 
@@ -45,17 +46,11 @@ def test_answers_are_as_stated(stated, hall_service, image, tmp_path):
         got = hall_service.post("/localize", image=given)
         assert got.json["status"] in (status, "unknown_scene")
         require_as_stated(stated, "/localize", got)
+        more = replace(got, body=json.dumps({**got.json, "more": 1}).encode())
         with pytest.raises(jsonschema.ValidationError):
-            changed = {**got.json, "more": 1}
-            require_as_stated(stated, "/localize", replace_json(got, changed))
+            require_as_stated(stated, "/localize", more)
     for path in ("/health", "/scenes"):
         require_as_stated(stated, path, hall_service.get(path))
-
-
-def replace_json(got, content):
-    import json
-
-    return replace(got, body=json.dumps(content).encode())
 
 
 def test_calibrations_of_both_mounts_and_a_shift_are_as_stated(
@@ -180,3 +175,33 @@ def test_the_page_says_what_the_service_is(stated, hall_service):
     for word in ("PNG", "metres", "w, x, y, z", "Bearer", "/track", "newest"):
         assert word in text
     assert b"dark-mode" in hall_service.get("/docs").body
+
+
+def test_errors_name_what_a_client_can_change(hall_service, image):
+    wide = ("p.csv", ",".join(f"c{i}" for i in range(200)).encode())
+    got = hall_service.post("/calibrations", images=image, robot_poses=wide)
+    owner = "whoever runs the service can raise it by --limits columns=200"
+    assert got.refusal[1].endswith(f"at most 100 are read; if it is right, {owner}")
+    for name, message in (
+        ("camera", "camera: send a file: a part with a file name"),
+        ("mount", "mount: Input should be 'eye_to_hand' or 'eye_in_hand'"),
+    ):
+        got = hall_service.post("/calibrations", images=image, **{name: "text"})
+        assert got.refusal == (422, message)
+    # What the line asks for is a field of the form.
+    table = ("p.csv", b"100 200 300 10 20 30\n")
+    got = hall_service.post("/calibrations", images=image, robot_poses=table)
+    assert "`convention`" in got.refusal[1]
+    got = hall_service.post(
+        "/calibrations",
+        images=image,
+        robot_poses=table,
+        convention="kuka",
+        mount="eye_to_hand",
+    )
+    assert got.json["mount"] == "eye_to_hand"
+    got = hall_service.post(
+        "/calibrations", images=image, robot_poses=table, convention="kukka"
+    )
+    assert got.refusal[0] == 400
+    assert "kukka" in got.refusal[1]

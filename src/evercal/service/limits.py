@@ -94,7 +94,9 @@ def camera_of(data: bytes | None, size: tuple[int, int]) -> Camera | None:
     return _from_text(data, "camera", ".json", lambda path: read_camera(path, size))
 
 
-def poses_of(data: bytes, ending: str, images: list[str]) -> SE3:
+def poses_of(
+    data: bytes, ending: str, images: list[str], convention: str | None
+) -> SE3:
     """(n,) base_from_gripper of n named images, by a pose table whose file had an ending."""
     files = list(map(Path, images))
     ending = ending.lower()
@@ -102,7 +104,7 @@ def poses_of(data: bytes, ending: str, images: list[str]) -> SE3:
         ending = ".csv"
 
     def read(path: Path) -> SE3:
-        return poses_of_images(path, files)[0]
+        return poses_of_images(path, files, convention)[0]
 
     return _from_text(data, "robot_poses", ending, read)
 

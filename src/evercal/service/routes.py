@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 from fastapi import (
     APIRouter,
@@ -17,7 +17,7 @@ from fastapi import (
 )
 from fastapi.responses import JSONResponse, RedirectResponse
 from prometheus_client import generate_latest
-from pydantic.json_schema import SkipJsonSchema
+from pydantic import WithJsonSchema
 from starlette.requests import HTTPConnection
 
 from evercal.bounds import RequestBounds
@@ -41,6 +41,7 @@ from evercal.service.limits import (
 )
 from evercal.service.live_map import LiveMap
 from evercal.service.schemas import (
+    FILE,
     IMAGES,
     SERVICE,
     CalibrationFile,
@@ -58,7 +59,8 @@ router = APIRouter(
     generate_unique_id_function=lambda route: route.name,
     responses={"4XX": {"model": Problem}, "5XX": {"model": Problem}},
 )
-OptionalFile = Upload | SkipJsonSchema[None]
+# Generators of clients would send an optional file that is null as text.
+OptionalFile = Annotated[Upload | None, WithJsonSchema(FILE)]
 CameraFile = Annotated[
     OptionalFile,
     File(description="Intrinsics: JSON, YAML or a 3x3 matrix as text."),
@@ -74,7 +76,16 @@ Scenes = Annotated[
         description="Names of scenes; others are not considered.",
     ),
 ]
+Convention = Annotated[
+    str,
+    Form(
+        default_factory=str,
+        description="Of the numbers in `robot_poses`, such as `kuka` or `ur`.",
+    ),
+]
 Shots = Annotated[list[Upload], File(description="Image files, all of one camera.")]
+_SHOTS = ("images", "camera", "robot_poses", "convention")
+"""Fields of images that are fused."""
 _NAME = 100
 """Characters of a file name that are kept."""
 
@@ -183,6 +194,7 @@ async def localize(
 async def _decode(
     service: Asked,
     images: Shots,
+    convention: Convention,
     camera: CameraFile = None,
     robot_poses: PosesFile = None,
 ) -> Callable[[Check], Images]:
@@ -200,7 +212,7 @@ async def _decode(
         poses = None
         if robot_poses is not None and table is not None:
             ending = Path(robot_poses.filename or "").suffix
-            poses = poses_of(table, ending, sent.names)
+            poses = poses_of(table, ending, sent.names, convention or None)
         return Images(sent, sent.camera(intrinsics), poses)
 
     return decode
@@ -213,7 +225,7 @@ Decode = Annotated[Callable[[Check], Images], Depends(_decode)]
     "/calibrations",
     tags=[IMAGES],
     response_model=CalibrationFile,
-    dependencies=[form("camera", "robot_poses", "mount", "scene", "images")],
+    dependencies=[form(*_SHOTS, "scene", "mount")],
 )
 async def calibrate(
     service: Asked,
@@ -221,8 +233,9 @@ async def calibrate(
     decode: Decode,
     scene: Scenes,
     mount: Annotated[
-        MountName | SkipJsonSchema[None],
+        MountName | None,
         Form(description="Beside the arm or on the gripper; else by the images."),
+        WithJsonSchema({"type": "string", "enum": get_args(MountName)}),
     ] = None,
 ) -> JSONResponse:
     """Calibrate a camera from its images: the calibration file."""
@@ -239,7 +252,7 @@ async def calibrate(
     "/check",
     tags=[IMAGES],
     response_model=CameraShift,
-    dependencies=[form("camera", "robot_poses", "calibration", "scene", "images")],
+    dependencies=[form(*_SHOTS, "scene", "calibration")],
 )
 async def check(
     service: Asked,

@@ -52,6 +52,10 @@ Matrix = list[list[float]]
 """Rows."""
 
 
+FILE = {"type": "string", "format": "binary"}
+"""Schema of a file of a form."""
+
+
 class Upload(UploadFile):
     """A file of a form.
 
@@ -66,7 +70,7 @@ class Upload(UploadFile):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, *_: Any) -> dict[str, Any]:
-        return {"type": "string", "format": "binary"}
+        return FILE
 
 
 class Record(BaseModel, use_attribute_docstrings=True):

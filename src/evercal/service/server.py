@@ -101,8 +101,10 @@ def make_app(
 
 
 _DARK = """<script>
-document.documentElement.classList.toggle("dark-mode", matchMedia("(prefers-color-scheme: dark)").matches)
+if (matchMedia("(prefers-color-scheme: dark)").matches)
+  document.documentElement.classList.add("dark-mode");
 </script></head>"""
+"""End of the head of a page that follows the browser."""
 
 
 def _page() -> HTMLResponse:
@@ -115,7 +117,7 @@ def _page() -> HTMLResponse:
         swagger_favicon_url=f"{files}favicon-32x32.png",
         swagger_ui_parameters={"tryItOutEnabled": True},
     )
-    return HTMLResponse(page.body.decode().replace("</head>", _DARK))
+    return HTMLResponse(bytes(page.body).decode().replace("</head>", _DARK))
 
 
 async def _poll(live: LiveMap) -> None:
