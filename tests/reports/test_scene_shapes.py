@@ -18,6 +18,7 @@ from evercal.reports.scene import (
     Landmarks3D,
     keyframe_views,
     readable_scale,
+    surface,
 )
 
 SIMILARITY = Similarity(SE3.exp([0.3, -0.2, 0.5, 0.4, -0.8, 0.2]), 2.5)
@@ -46,6 +47,25 @@ def test_landmarks_project_onto_their_pixels_and_have_their_grey(
         np.testing.assert_allclose(view.camera.project(local), marks.pixels, atol=1e-6)
         column, row = marks.pixels.round().astype(int).T
         np.testing.assert_array_equal(landmarks.grey[own], view.image[row, column, 0])
+
+
+def test_surfaces_are_the_pixels_near_landmarks_at_about_their_depths(
+    scene: SceneMap,
+) -> None:
+    alone = replace(scene, keyframes=scene.keyframes.take(np.array([1])))
+    shown = surface(alone)
+    (view,) = keyframe_views(alone)
+    (marks,) = alone.keyframes.landmarks
+    local = view.frustum.base_from_camera.inverse().apply(shown.points_m)
+    pixels = view.camera.project(local)
+    column, row = pixels.round().astype(int).T
+    np.testing.assert_allclose(pixels, np.column_stack([column, row]), atol=1e-6)
+    np.testing.assert_array_equal(shown.grey, view.image[row, column, 0])
+    apart = np.linalg.norm(pixels[:, None] - marks.pixels, axis=2)
+    assert (apart.min(axis=1) < 11).all()
+    ratio = local[:, 2] / view.depths_m[apart.argmin(axis=1)]
+    assert np.median(ratio) == pytest.approx(1, abs=0.02)
+    assert len(shown) > 3 * len(marks)
 
 
 def test_deviation_is_the_distance_by_which_the_depth_moves_a_landmark(

@@ -67,6 +67,20 @@ def test_only_the_printed_address_shows_the_page(server):
     assert status(server, f"/{key}/", Origin="http://page.example") == 403
 
 
+def test_the_first_page_asks_for_the_colours_of_the_system(server):
+    """The page that it leads to is viser's; a reload of that asks no more."""
+    shown = {}
+    for path in (f"/{server.key}/", f"/{server.key}/?light"):
+        connection = http.client.HTTPConnection("127.0.0.1", server.get_port())
+        connection.request("GET", path)
+        shown[path] = connection.getresponse().read().decode()
+        connection.close()
+    first, then = shown.values()
+    assert "prefers-color-scheme: dark" in first
+    assert "?darkMode" in first
+    assert len(first) < 1000 < len(then)
+
+
 def test_no_page_of_another_origin_connects(server):
     key = server.key
     here = f"http://127.0.0.1:{server.get_port()}"

@@ -185,6 +185,8 @@ def test_a_keyframe_is_looked_through_until_back(localizer):
     with page_of(localizer) as page:
         view = page.map.keyframes["hall"][2]
         client = MagicMock()
+        client.camera.image_width = 1056
+        client.camera.image_height = 900
         page.look_through(view, client)
         pose = view.frustum.base_from_camera
         seen = SE3(client.camera.wxyz, client.camera.position)
@@ -197,6 +199,69 @@ def test_a_keyframe_is_looked_through_until_back(localizer):
         np.testing.assert_allclose(
             client.camera.position, page.server.initial_camera.position
         )
+
+
+@pytest.mark.parametrize("size_px", [(1056, 900), (390, 844)])
+def test_the_overview_holds_base_arm_and_calibrations_beside_the_panel(
+    localizer, tmp_path, size_px
+):
+    """On a phone the panel lies over the lower part of the picture."""
+    (tmp_path / "arm.urdf").write_text(ARM)
+    files = [tmp_path / "fixed.json", tmp_path / "wrist.json"]
+    calibration("eye_to_hand").write(files[0])
+    calibration("eye_in_hand").write(files[1])
+    with page_of(localizer, files, tmp_path / "arm.urdf") as page:
+        camera = MagicMock()
+        page.look_around(camera, size_px)
+        if size_px == (1056, 900):
+            first = page.server.initial_camera
+            np.testing.assert_allclose(camera.position, first.position)
+            np.testing.assert_allclose(camera.look_at, first.look_at)
+        seen = [np.zeros(3), HAND.translation_m, [0, 0, 0.5]]
+        x, y = pixels_of(camera, np.array(seen), size_px).T
+    free = size_px[1] if size_px[0] > 576 else 0.42 * size_px[1]
+    assert ((x > 0) & (x < size_px[0])).all()
+    assert ((y > 0) & (y < free)).all()
+
+
+def pixels_of(
+    camera: Any, points_m: np.ndarray, size_px: tuple[int, int]
+) -> np.ndarray:
+    """Pixels (n, 2) of points in a picture of viser."""
+    width, height = size_px
+    forward = np.subtract(camera.look_at, camera.position)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(forward, right), forward])
+    local = (points_m - camera.position) @ axes.T
+    assert (local[:, 2] > 0).all()
+    scale = height / 2 / np.tan(camera.fov / 2)
+    return scale * local[:, :2] / local[:, 2:] + [width / 2, height / 2]
+
+
+def test_without_an_arm_the_gripper_is_where_it_took_the_first_keyframe(
+    localizer, tmp_path
+):
+    wrist = calibration("eye_in_hand", source={"scene": "hall"})
+    wrist.write(tmp_path / "wrist.json")
+    with page_of(localizer, [tmp_path / "wrist.json"]) as page:
+        gripper = page.server.scene.add_frame("/other", visible=False)
+        camera = page.map.gripper_of(gripper, wrist) @ HAND
+        first = page.map.keyframes["hall"][0].frustum.base_from_camera
+        assert max(pose_distance(camera, first)) < 1e-9
+        assert gripper.visible
+
+
+def test_surfaces_are_shown_as_in_the_images_and_landmarks_by_a_value(localizer):
+    with page_of(localizer) as page:
+        (cloud,) = page.map._clouds.values()
+        landmarks = page.map.landmarks["hall"]
+        assert len(cloud.points) > 3 * len(landmarks)
+        page.map.colour_by("height")
+        np.testing.assert_allclose(cloud.points, landmarks.points_m, rtol=1e-6)
+        page.map.colour_by("image")
+        assert len(cloud.points) > 3 * len(landmarks)
 
 
 def test_names_of_files_are_no_markup():

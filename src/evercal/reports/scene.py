@@ -5,10 +5,11 @@ corrections of `mapping.map_frame`, usually about a millimetre.
 """
 
 from collections.abc import Sequence
-from dataclasses import field
+from dataclasses import field, replace
 from typing import Literal, NamedTuple, Self
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, UncertainPose, norms
@@ -26,6 +27,12 @@ _SCALES = (500, 200, 100, 50, 20, 10, 5, 2)
 """Factors that enlarge drawn ellipsoids."""
 MOST_POINTS = 50_000
 """Landmarks that are shown of all scenes together; more are thinned out evenly."""
+_MOST_PIXELS = 150_000
+"""Pixels that are shown around the landmarks of a scene."""
+_PATCH_PX = 11.0
+"""Radius of the surface that is shown around a landmark, pixels of its keyframe."""
+_STEP_PX = 2
+"""Distance of the pixels that are shown."""
 THUMBNAIL_PX = 160
 """Width of the image in a frustum."""
 ABOVE: Plane = (0, 1)
@@ -157,6 +164,24 @@ class Landmarks3D:
             values = np.asarray(self.points_m[:, 2], float)
         low, high = np.percentile(values, [2, 98]).tolist()
         return colour_map(values, (low, high))
+
+
+def surface(scene: SceneMap) -> Landmarks3D:
+    """The pixels around landmarks as landmarks, on the planes of the slopes that were measured."""
+    patches = []
+    for camera, marks in zip(
+        scene.keyframes.cameras, scene.keyframes.landmarks, strict=True
+    ):
+        every = np.mgrid[: camera.height : _STEP_PX, : camera.width : _STEP_PX]
+        pixels = every[::-1].reshape(2, -1).T
+        distance, nearest = KDTree(marks.pixels).query(pixels)
+        near = distance < _PATCH_PX
+        own = marks.take(nearest[near])
+        change = (own.slope * (pixels[near] - own.pixels)).sum(axis=1)
+        inverse = own.inverse_depth + change
+        patches.append(replace(own, pixels=pixels[near], inverse_depth=inverse))
+    keyframes = replace(scene.keyframes, landmarks=tuple(patches))
+    return Landmarks3D.of(replace(scene, keyframes=keyframes), _MOST_PIXELS)
 
 
 @frozen_arrays

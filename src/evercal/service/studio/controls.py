@@ -91,7 +91,6 @@ class Controls:
         self._updates: list[Callable[[], None]] = []
         """Calls that bring single controls up to date."""
         gui = self._gui
-        gui.main_panel.dock_right()
         cameras = studio.connection.devices.cameras
         labels = [label for label, which in _CAMERAS.items() if which in cameras]
         self._camera = gui.add_dropdown("Camera", labels)

@@ -22,13 +22,18 @@ from evercal.reports.scene import (
     Landmarks3D,
     keyframe_views,
     readable_scale,
+    surface,
 )
 from evercal.robot.robot_model import RobotModel
-from evercal.service.viewer.html import GREY, MAGENTA, Colour
+from evercal.service.viewer.html import BLUE, MAGENTA, PALE, Colour
 
 OnKeyframe = Callable[[KeyframeView, viser.ClientHandle], Any]
 GRIPPER = "/gripper"
 """Node of what moves with the gripper."""
+_PIXEL = 0.009
+"""Size of a pixel of a surface, relative to the extent of the first scene."""
+_LANDMARK = 0.005
+"""Size of a landmark, relative to the same."""
 
 
 def add_frustum(
@@ -75,8 +80,9 @@ def add_base(server: viser.ViserServer, side_m: float) -> viser.FrameHandle:
         side_m,
         side_m,
         cell_size=0.1,
-        cell_color=(60, 66, 76),
-        section_color=(80, 87, 99),
+        cell_color=PALE,
+        section_color=PALE,
+        cell_thickness=0.5,
         shadow_opacity=0.0,
     )
     return server.scene.add_frame(GRIPPER, show_axes=False, visible=False)
@@ -93,6 +99,7 @@ class DrawnMap:
     ):
         self.landmarks = {scene.name: Landmarks3D.of(scene) for scene in scenes}
         self.keyframes = {scene.name: keyframe_views(scene) for scene in scenes}
+        self._surfaces = {scene.name: surface(scene) for scene in scenes}
         # Twice the median distance of landmarks from their median.
         points = self.landmarks[scenes[0].name].points_m
         distances = norms(points - np.median(points, axis=0))
@@ -105,6 +112,7 @@ class DrawnMap:
         with server.atomic():
             for scene in scenes:
                 self._add(server, scene.name, on_keyframe)
+            self.colour_by("image")
         self.show(scenes[0].name)
 
     def node(self, scene: object) -> str:
@@ -113,6 +121,14 @@ class DrawnMap:
         if node is None:
             return "/base"
         return node.name
+
+    def gripper_of(self, node: viser.FrameHandle, calibration: Calibration) -> SE3:
+        """Pose of the gripper; without an arm, as it was at the first keyframe of its scene."""
+        keyframes = self.keyframes.get(str(calibration.source.get("scene")))
+        if keyframes and not node.visible:
+            pose = keyframes[0].frustum.base_from_camera
+            place(node, pose @ calibration.parent_from_child.inverse())
+        return SE3(node.wxyz, node.position)
 
     def show(self, scene: str) -> None:
         """Show one scene; visitors show others in the scene tree of viser's settings."""
@@ -125,30 +141,36 @@ class DrawnMap:
             camera.visible = visible
 
     def colour_by(self, by: ColourBy) -> None:
-        """Colour the landmarks."""
+        """Show the surface as in the images, or landmarks in the colour of a value."""
         for name, cloud in self._clouds.items():
-            cloud.colors = self.landmarks[name].colours(by)
+            shown = self.landmarks[name]
+            size = _LANDMARK
+            if by == "image":
+                shown = self._surfaces[name]
+                size = _PIXEL
+            cloud.point_size = size * self.extent_m
+            cloud.points = shown.points_m.astype(np.float32)
+            cloud.colors = shown.colours(by)
 
     def _add(
         self, server: viser.ViserServer, name: str, on_keyframe: OnKeyframe | None
     ) -> None:
-        landmarks = self.landmarks[name]
         node = f"/map/{name.replace('/', '_')}"
         self._nodes[name] = server.scene.add_frame(node, show_axes=False)
         self._clouds[name] = server.scene.add_point_cloud(
             f"{node}/landmarks",
-            landmarks.points_m.astype(np.float32),
-            landmarks.colours("image"),
-            point_size=0.003 * self.extent_m,
+            np.zeros((0, 3), np.float32),
+            np.zeros((0, 3), np.uint8),
             point_shape="circle",
             precision="float32",
+            point_shading="flat",
         )
         if on_keyframe is None:
             return
         for view in self.keyframes[name]:
             keyframe = f"{node}/keyframes/{view.number}"
             camera = add_frustum(
-                server, keyframe, view.frustum, self.frustum_m, GREY, view.image
+                server, keyframe, view.frustum, self.frustum_m, BLUE, view.image
             )
             camera.on_click(lambda event, view=view: on_keyframe(view, event.client))
             self._cameras.append(camera)
@@ -166,7 +188,7 @@ def add_calibrations(
     Where no map is drawn, they are in the base.
     """
     ellipsoids = [Ellipsoid.of(c.uncertain_pose) for c in calibrations.values()]
-    scale = readable_scale(ellipsoids)
+    scale = readable_scale(ellipsoids, size_m / 2)
     for ellipsoid, (name, calibration) in zip(
         ellipsoids, calibrations.items(), strict=True
     ):
@@ -189,7 +211,7 @@ def add_calibrations(
             position=ellipsoid.centre_m,
         )
         sigma = f"{calibration.sigma_mm:.2g} mm (1 sigma)"
-        words = f"{name}: {sigma}, ellipsoid x {scale:g}"
+        words = f"{Path(name).stem}: {sigma}, ellipsoid x {scale:g}"
         server.scene.add_label(f"{node}/label", words)
 
 

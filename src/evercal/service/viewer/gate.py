@@ -11,10 +11,17 @@ from typing import Any
 
 import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from evercal.errors import InputError
 from evercal.service.hosts import refusal
+
+_START = """<!doctype html><title>evercal</title><script>
+const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+location.replace(dark ? "?darkMode" : "?light");
+</script>"""
+"""Leads to viser's page as light or as dark as the visitor's system, which viser does not ask."""
 
 
 @contextmanager
@@ -35,6 +42,8 @@ def gated(key: str, local: bool) -> Iterator[None]:
             if reason := refusal(request.path, request.headers, key, local):
                 return connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
             path = request.path.removeprefix(f"/{key}")
+            if path in ("", "/") and "Upgrade" not in request.headers:
+                return _page(_START)
             return process_request(connection, Request(path or "/", request.headers))
 
         opened.append(address)
@@ -49,6 +58,11 @@ def gated(key: str, local: bool) -> Iterator[None]:
         raise InputError(
             "this version of viser opens its server otherwise; see constraints.txt"
         )
+
+
+def _page(html: str) -> Response:
+    headers = Headers({"Content-Type": "text/html", "Cache-Control": "no-store"})
+    return Response(HTTPStatus.OK, "OK", headers, html.encode())
 
 
 def chosen(dropdown: Any) -> Any:

@@ -14,6 +14,8 @@ RED = (220, 38, 38)
 GREY = (107, 114, 128)
 BLUE = (37, 99, 235)
 MAGENTA = (192, 38, 211)
+PALE = (150, 156, 166)
+"""Lines of the floor, on light and on dark paper."""
 Colour = tuple[int, int, int]
 _COLOURS = {
     "waits": GREY,

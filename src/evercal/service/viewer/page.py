@@ -6,14 +6,14 @@ import secrets
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import viser
 
 from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.errors import InputError
-from evercal.geometry import SE3
+from evercal.geometry import SE3, norms
 from evercal.live.camera import StreamCamera
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker
@@ -31,9 +31,12 @@ from evercal.service.viewer.html import (
     position_mm,
     rows_html,
 )
+from evercal.service.viewer.overview import FOV_RAD, WINDOW_PX, overview
 
 _THROUGH = "/through"
 """Node of the image behind the landmarks of a keyframe."""
+_NEAREST = 92
+"""Landmarks in the overview, percent; the others are far away, such as behind a window."""
 
 
 class Page:
@@ -58,12 +61,20 @@ class Page:
             default = scenes[0].adjusted_camera
             size_m = self.map.frustum_m
             drawing.add_calibrations(server, given, self.map, default, size_m)
-            self._begin_behind(scenes[0].name)
-            self._add_controls(given)
             if urdf is not None:
                 links = [c.parent_frame for c in given.values() if c.on_gripper]
                 bases = [one.frames.base for one in (*scenes, *given.values())]
                 drawing.add_arm(server, urdf, gripper, links, bases)
+            self._outlines = [np.zeros((1, 3)), gripper.position[None]]
+            for one in given.values():
+                pose = one.parent_from_child
+                if one.on_gripper:
+                    pose = self.map.gripper_of(gripper, one) @ pose
+                view = Frustum.of(pose, one.camera or default)
+                self._outlines.append(view.corners(size_m))
+            self._add_controls(given)
+            self.look_around(server.initial_camera)
+            server.on_client_connect(self._fit)
         except BaseException:
             self.close()
             raise
@@ -104,24 +115,29 @@ class Page:
 
     def look_from_above(self, client: viser.ClientHandle) -> None:
         """Bring a visitor back to the first view."""
-        first = self.server.initial_camera
+        camera = client.camera
         with client.atomic():
             client.scene.remove_by_name(_THROUGH)
-            client.camera.up_direction = (0.0, 0.0, 1.0)
-            client.camera.fov = first.fov
-            client.camera.position = first.position
-            client.camera.look_at = first.look_at
+            camera.up_direction = (0.0, 0.0, 1.0)
+            self.look_around(camera, (camera.image_width, camera.image_height))
         self.map.show_keyframes(True)
 
-    def _begin_behind(self, scene: str) -> None:
+    def look_around(self, camera: Any, size_px: tuple[int, int] = WINDOW_PX) -> None:
+        """Turn a camera of viser to landmarks, base, calibrations and arm."""
+        scene = chosen(self._scene)
+        points = self.map.landmarks[scene].points_m
+        apart = norms(points - np.median(points, axis=0))
+        near = points[apart <= np.percentile(apart, _NEAREST)]
+        points = np.concatenate([near, *self._outlines])
         keyframes = self.map.keyframes[scene]
         poses = SE3.stack([view.frustum.base_from_camera for view in keyframes])
-        ahead = poses.rotation_matrix()[:, :, 2].mean(0) * (1, 1, 0)
-        camera = self.server.initial_camera
-        middle = poses.translation_m.mean(0)
-        offset = np.array([0, 0, 0.4]) - 0.6 * ahead
-        camera.position = middle + self.map.extent_m * offset
-        camera.look_at = middle
+        ahead = poses.rotation_matrix()[:, :, 2].mean(axis=0)
+        camera.fov = FOV_RAD
+        camera.position, camera.look_at = overview(points, ahead, size_px)
+
+    def _fit(self, client: viser.ClientHandle) -> None:
+        if client.camera.aspect < 1:
+            self.look_from_above(client)
 
     def _add_controls(self, given: dict[str, Calibration]) -> None:
         gui = self.server.gui
@@ -134,7 +150,8 @@ class Page:
                 ("landmarks", f"{landmarks:,}"),
             ]
             gui.add_html(rows_html(counts))
-            scene = gui.add_dropdown("Scene", tuple(drawn.keyframes))
+            scene = self._scene = gui.add_dropdown("Scene", tuple(drawn.keyframes))
+            scene.visible = len(drawn.keyframes) > 1
             colour = gui.add_dropdown("Colour", get_args(ColourBy))
             back = gui.add_button("Back to the overview")
         scene.on_update(lambda _: drawn.show(chosen(scene)))
@@ -229,7 +246,8 @@ def start_server(host: str, port: int, label: str) -> _Server:
     with gated(key, is_local(host)), contextlib.redirect_stdout(io.StringIO()):
         server = _Server(host, port, label=label, verbose=False)
     server.key = key
+    server.gui.main_panel.dock_right()
     server.gui.configure_theme(
-        dark_mode=True, show_logo=False, show_share_button=False, control_width="large"
+        show_logo=False, show_share_button=False, control_width="large"
     )
     return server

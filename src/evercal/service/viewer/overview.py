@@ -1,0 +1,47 @@
+"""Where a visitor looks from, so that everything that matters lies beside the panel."""
+
+import numpy as np
+
+from evercal.typing import Array
+
+FOV_RAD = np.deg2rad(50.0)
+"""Vertical angle of view."""
+WINDOW_PX = (1056, 900)
+"""Picture beside the panel of a wide window."""
+_PHONE_PX = 576
+"""Width up to which viser lays the panel over the lower part of the picture."""
+_COVERED = 1.2
+"""Height that the panel covers of a phone's picture, in halves of that height."""
+_DOWN_RAD = np.deg2rad(32.0)
+"""Angle by which the visitor looks down."""
+_MARGIN = 0.92
+"""Share of the picture that is used."""
+
+
+def overview(
+    points_m: Array, ahead: Array, size_px: tuple[int, int] = WINDOW_PX
+) -> tuple[Array, Array]:
+    """Position and target of a view that shows points (n, 3) in a picture.
+
+    The visitor looks to `ahead` (3,), whose height does not count.
+    """
+    width, height = size_px
+    x, y = ahead[:2] / (np.hypot(*ahead[:2]) + 1e-12)
+    right = np.array([y, -x, 0.0])
+    level = np.cos(_DOWN_RAD)
+    forward = np.array([level * x, level * y, -np.sin(_DOWN_RAD)])
+    axes = np.stack([right, np.cross(forward, right), forward])
+    local = points_m @ axes.T
+    depths = local[:, 2:]
+    slopes = np.tan(FOV_RAD / 2) * np.array([width / height, 1.0])
+    low = _MARGIN * slopes
+    high = low.copy()
+    if width <= _PHONE_PX:
+        high[1] -= _COVERED * slopes[1]
+    # From (place, depth), -low <= (point - place) / (its depth - depth) <= high.
+    least = (local[:, :2] - high * depths).max(axis=0)
+    most = (local[:, :2] + low * depths).min(axis=0)
+    depth = ((most - least) / (low + high)).min()
+    place = (least + most + (high - low) * depth) / 2
+    position = np.append(place, depth) @ axes
+    return position, position + (np.median(depths) - depth) * forward
