@@ -178,6 +178,9 @@ def test_check_from_one_file(
 
     still = shift(hall.test[3])
     bumped = shift(hall.test[4])
+    now = tmp_path / "now.png"
+    for path in (now, str(now)):
+        assert hall_only.localize(path).status == "ok"
     assert still.same_map
     assert bumped.same_map
     assert not still.moved

@@ -17,6 +17,7 @@ from evercal.errors import InputError
 from evercal.learning.learned_scenes import LearnedScenes
 from evercal.mapping.store import MapStore
 from evercal.recordings.frame import Recording
+from evercal.recordings.images import read_image
 from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.robot.mount import MountName
 from evercal.typing import PathLike
@@ -101,8 +102,12 @@ class Map(LearnedScenes):
         unpack_map(Path(file), Path(path))
         return cls.open(path, **how)
 
-    def localize(self, image: np.ndarray, camera: Camera | None = None) -> PoseEstimate:
-        """Estimate the camera pose of one image, see `Localizer.localize`."""
+    def localize(
+        self, image: np.ndarray | PathLike, camera: Camera | None = None
+    ) -> PoseEstimate:
+        """Estimate the camera pose of one image or image file, see `Localizer.localize`."""
+        if isinstance(image, str | Path):
+            image = read_image(image)
         return self.localizer.localize(image, camera)
 
     def track(

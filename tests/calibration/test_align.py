@@ -78,6 +78,7 @@ def test_camera_on_the_gripper_determines_the_base(
     assert alignment.given == 10
     assert alignment.warnings == ()
     assert alignment.used >= 8
+    assert alignment.used + len(alignment.left_out) == 10
     assert alignment.similarity.scale == pytest.approx(scale, rel=0.01)
     assert alignment.gripper_from_camera is not None
     assert pose_distance(alignment.gripper_from_camera, GRIPPER_FROM_CAMERA)[0] < 0.01

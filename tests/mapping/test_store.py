@@ -67,7 +67,7 @@ def test_any_scene_name_is_stored(
         make(root, [replace(scenes[1], name=name)])
         assert MapStore.open(root).contents.scenes[0].name == name
         assert [path.name for path in tmp_path.iterdir()] == ["deep"]
-        assert {path.name for path in root.parent.iterdir()} == {"store", ".store.lock"}
+        assert {path.name for path in root.parent.iterdir()} == {"store"}
         shutil.rmtree(root)
 
 

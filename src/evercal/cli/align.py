@@ -120,10 +120,15 @@ class Align(args.Verb):
 
     def _show(self, alignment: "MapAlignment", unit: float) -> None:
         """Print it; `unit` is that of the recording, per unit of the map."""
+        from evercal.storage.text_files import few
+
         similarity = alignment.similarity
         mm, deg = alignment.sigma
         scale = similarity.scale / unit  # metres per unit of the recording
         mount = alignment.gripper_from_camera
+        lines = list(map("warning: {}".format, alignment.warnings))
+        if alignment.left_out:
+            lines.insert(0, f"  left out     {few(alignment.left_out, most=8)}")
         self.answer(
             {
                 "scene": self.scene,
@@ -135,10 +140,11 @@ class Align(args.Verb):
                 "given": alignment.given,
                 "gripper_from_camera": mount and mount.matrix().tolist(),
                 "warnings": alignment.warnings,
+                "left_out": alignment.left_out,
             },
             f"aligned {self.scene}: standard deviation {mm:.2f} mm and {deg:.3f} deg per axis in"
             f" the middle of the scene; scale {scale:.5f}; {alignment.used} of"
             f" {alignment.given} are inliers, residual {alignment.residual}",
-            *(f"warning: {warning}" for warning in alignment.warnings),
+            *lines,
             then=("calibrate", self.store, "IMAGE..."),
         )

@@ -152,7 +152,7 @@ def _learn(cell: "Map", scene: "Recording", result: "DemoResult", quiet: bool) -
     if not quiet:
         say(
             f"mapped {room.room}: {room.images} images, {room.keyframes} keyframes,"
-            f" {room.landmarks} landmarks, {room.seconds:.0f} s; {size(result.memory_bytes)} for"
+            f" {room.landmarks:,} landmarks, {room.seconds:.0f} s; {size(result.memory_bytes)} for"
             " all rooms"
         )
 

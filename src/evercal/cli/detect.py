@@ -113,7 +113,7 @@ class Detect(args.Verb):
             poses, warning = compared_lens(poses)
         poses.write(self.out)
         solve = ("solve", "--robot-poses", "FILE", "--camera-poses", self.out)
-        then = (*solve, "--mount", "eye_in_hand")
+        then = (*solve, "--mount", "MOUNT")
         self.answer(poses.to_dict(), *_lines(poses, warning), then=then)
         return 0
 

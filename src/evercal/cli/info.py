@@ -129,6 +129,6 @@ def adjusted_row(scene: str, adjusted: dict[str, Any]) -> dict[str, object]:
         "error of stated poses": f"{length(sigma)}{adjusted['pose_sigma_deg']:.3f} deg",
         "common transform": f"{length(shift_mm)}{rotation_deg:.3f} deg",
         "focal length": f"{adjusted['focal_percent']:+.2f} %",
-        "wrong poses": len(adjusted["wrong_poses"]),
+        "poses left out": len(adjusted["wrong_poses"]),
         "untracked": len(adjusted.get("untracked", ())),
     }

@@ -58,5 +58,6 @@ class Serve(args.Verb):
         what = ", ".join(scenes) or "no scene yet"
         self.answer(
             {"url": url, "store": str(self.store), "scenes": list(scenes)},
-            f"serving {self.store} ({what}) at {url}; its page is {url}/docs",
+            f"serving {self.store} ({what}), with a page of its requests:",
+            f"  {url}",
         )

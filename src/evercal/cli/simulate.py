@@ -64,5 +64,9 @@ class Simulate(args.Verb):
             "frames": bar.n,
             "seconds": seconds,
         }
-        self.answer(record, then=("learn", "MAP", self.out / "wrist"))
+        counts = (
+            f"{frames} wrist, {cell.TRIPOD_IMAGES} tripod and {cell.HELD_IMAGES} held"
+        )
+        line = f"wrote {self.out}: {counts} images, and what is true in truth.json"
+        self.answer(record, line, then=("learn", "MAP", self.out / "wrist"))
         return 0

@@ -30,8 +30,8 @@ _REAL = (
 class Studio(PageVerb):
     """Calibrate wrist and fixed camera in the browser, step by step.
 
-    Everything is written to --out as it is made; the same command continues there. Without
-    --camera, the fixed camera is calibrated by a textured thing in the gripper. With --virtual, a
+    Everything is written to --out as it is made; the same command continues there. A fixed camera
+    alone, without --camera, is calibrated by a textured thing in the gripper. With --virtual, a
     virtual arm with two cameras stands in for yours.
 
     Example: evercal studio --camera 0 --intrinsics camera.json --poses poses.csv
@@ -76,9 +76,7 @@ class Studio(PageVerb):
         page = StudioPage(Session(devices, self.out, self.map), self.host, self.port)
         try:
             url = page.server.url
-            self.wait(
-                url, f"studio in {self.out} at {url}, where the same command continues"
-            )
+            self.wait(url, f"studio in {self.out}, where the same command continues")
         finally:
             page.close()
         return 0

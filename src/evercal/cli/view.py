@@ -30,10 +30,10 @@ class PageVerb(args.Verb):
             raise missing_extra(f"the page needs {error.name}", "view") from None
 
     def wait(self, url: str, words: str) -> None:
-        """Print words, or the address as JSON, and wait for SIGTERM or Ctrl-C."""
+        """Print words and the address, or it as JSON, and wait for SIGTERM or Ctrl-C."""
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         with contextlib.suppress(KeyboardInterrupt):
-            self.answer({"url": url}, f"{words}; Ctrl-C ends it")
+            self.answer({"url": url}, f"{words}; Ctrl-C ends it:", f"  {url}")
             while True:
                 time.sleep(1.0)  # Ctrl-C does not end a wait without end on Windows
 
@@ -75,9 +75,7 @@ class View(PageVerb):
             url = page.server.url
             port = page.server.get_port()
             tunnel = f"ssh -L {port}:127.0.0.1:{port} {socket.gethostname()}"
-            self.wait(
-                url, f"view of {self.store} at {url} (from another machine: {tunnel})"
-            )
+            self.wait(url, f"view of {self.store} (from another machine: {tunnel})")
         finally:
             page.close()
         return 0

@@ -43,7 +43,8 @@ def stated_warnings(adjusted: Adjusted, camera_stated: bool) -> Iterator[str]:
         names = few(adjusted.wrong_poses, most=8)
         yield f"poses that contradict the images, left out: {names}"
     if adjusted.doubtful_poses:
-        yield f"poses with large errors: {few(adjusted.doubtful_poses, most=8)}"
+        names = few(adjusted.doubtful_poses, most=8)
+        yield f"poses with large errors, given less weight: {names}"
 
 
 def _depth(adjusted: Adjusted) -> Iterator[str]:

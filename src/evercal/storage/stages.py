@@ -170,7 +170,6 @@ class StageStore(Generic[Contents]):
         Yields:
             The manifest that will be replaced; one without stages for a new store.
         """
-        # The lock file is never removed: a process that waits for it would lock a deleted file.
         try:
             Path(self._lock.lock_file).parent.mkdir(parents=True, exist_ok=True)
             self._lock.acquire(timeout=0)
@@ -193,6 +192,9 @@ class StageStore(Generic[Contents]):
                 _require_no_scenes(self.root)
             yield before
         finally:
+            # Who waits tries again: the file that it has opened has no links any more.
+            if os.name == "posix" and self._lock.lock_counter == 1:
+                Path(self._lock.lock_file).unlink(missing_ok=True)
             self._lock.release()
 
     def add(

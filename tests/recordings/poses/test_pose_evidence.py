@@ -88,7 +88,7 @@ WRONG: dict[str, tuple[Callable[[SE3], SE3], str]] = {
         lambda poses: (poses @ FLIP).inverse(),
         "the inverse with OpenGL's camera axes",
     ),
-    "order": (reordered, "they are with quaternions in another order"),
+    "order": (reordered, "they are with angles or quaternions in another order"),
     "body": (
         lambda poses: poses @ GRIPPER_FROM_CAMERA,
         "those of another frame, at a fixed angle",
@@ -114,7 +114,7 @@ def test_wrong_gripper_poses_are_reported(bedroom: tuple[Frame, ...]) -> None:
     (warning,) = rotation_warnings(bedroom, gripper.inverse(), False)
     assert "they are gripper_from_base, the inverse" in warning
     (warning,) = rotation_warnings(bedroom, reordered(gripper), False)
-    assert "with quaternions in another order" in warning
+    assert "with angles or quaternions in another order" in warning
     (warning,) = rotation_warnings(bedroom, as_degrees(gripper), False)
     assert (
         "are angles in the stated unit" in warning

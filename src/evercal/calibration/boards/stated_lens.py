@@ -39,7 +39,7 @@ def compared_lens(stated: BoardPoses) -> tuple[BoardPoses, str]:
     words = (
         f"the board contradicts the camera file: corners fit to {stated.corner_sigma_px:.2f} px"
         f" with it and to {free.corner_sigma_px:.2f} px without; it moves the corners of the image"
-        f" by {_moved_px(camera, estimated):.0f} px. Check the file, or omit --camera"
+        f" by {_moved_px(camera, estimated):.0f} px. Check the file, or omit `camera`"
     )
     return replace(stated, images=tuple(images)), words
 

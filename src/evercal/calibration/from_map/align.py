@@ -54,6 +54,8 @@ class MapAlignment:
     """Standard deviation per axis in the middle of the scene, millimetres and degrees."""
     warnings: Strings = ()
     """What the robot's motions contradict."""
+    left_out: Strings = ()
+    """Names of images that were not located, or are outliers."""
 
     def applied_to(self, scene: SceneMap) -> SceneMap:
         """Return the scene with answers in the base frame, whatever its recording stated."""
@@ -116,6 +118,7 @@ def align_by_gripper(
     size = 12 + solution.equation.extras.names.index("size")
     covariance, sigma = _frame_covariance(fit, similarity, map_from_camera, size)
     residual = fit.residual[fit.inliers].reshape(-1, 2, 3)
+    used = {name for name, inlier in zip(names, fit.inliers, strict=True) if inlier}
     metres, radians = np.sqrt((residual**2).sum(2).mean(0))
     return MapAlignment(
         similarity,
@@ -126,6 +129,7 @@ def align_by_gripper(
         fit.at.parent_from_camera,
         sigma,
         solution.warnings,
+        tuple(name for name, _ in images if name not in used),
     )
 
 

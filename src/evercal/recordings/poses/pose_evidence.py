@@ -119,7 +119,9 @@ def _readings(
     swapped = Rotation.from_quat(poses.rotation_wxyz)
     first = swapped[first_frames]
     second = swapped[second_frames]
-    readings["with quaternions in another order"] = (first.inv() * second).as_rotvec()
+    readings["with angles or quaternions in another order"] = (
+        first.inv() * second
+    ).as_rotvec()
     return stated, readings
 
 
