@@ -2,7 +2,6 @@
 
 - README, CONTRIBUTING, CHANGELOG and SECURITY become pages; README is the start page.
 - Links that leave docs/ lead to these pages, or to a copy of the file in the site.
-- Main tutorials are offered as notebooks (notebooks.py).
 - "```json kitchen/scene.json" becomes a titled block.
 - A comment `<!-- help of every verb -->` becomes the help of the command line, and
   `<!-- every public name -->` the reference of the Python interface.
@@ -22,7 +21,6 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 sys.path.insert(0, str(Path(__file__).parent))  # MkDocs loads this file alone
-from notebooks import NOTEBOOKS, notebook_of
 
 ROOT = Path(__file__).parents[2]
 ROOT_PAGES = {
@@ -106,10 +104,6 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         uri = site_uri(path) or ""
         if uri.startswith(f"{COPIES}/"):
             files.append(File.generated(config, uri, abs_src_path=str(ROOT / path)))
-    for name in NOTEBOOKS:
-        files.append(
-            File.generated(config, f"tutorials/{name}.ipynb", content=notebook_of(name))
-        )
     return files
 
 
@@ -118,9 +112,6 @@ def on_page_markdown(markdown: str, *, page: Page, **_: Any) -> str:
     if page.file.abs_src_path:  # those of the root were rewritten when they were added
         source = Path(page.file.abs_src_path).relative_to(ROOT).as_posix()
         markdown = with_site_links(markdown, source)
-    name = Path(page.file.src_uri).stem
-    if page.file.src_uri.startswith("tutorials/") and name in NOTEBOOKS:
-        markdown += f"\n[This page as a notebook]({name}.ipynb)\n"
     markdown = _FENCE.sub(r'\1 title="\2"', markdown)
     if HELP in markdown:
         markdown = markdown.replace(HELP, _help_of_every_verb())

@@ -1,6 +1,6 @@
 """Draw README's picture, a located image: python docs/_site/located.py cell.evercal IMAGE.
 
-The map is that of docs/tutorials/wrist-camera.md, the image samples/cell/tripod/0004.jpg.
+The map is that of examples/01_wrist.py, the image samples/cell/tripod/0004.jpg.
 """
 
 import sys

@@ -10,7 +10,9 @@ from evercal.recordings import load_recording
 def test_a_cell_has_the_stated_parts(run, tmp_path):
     out = tmp_path / "cell"
     words = ("--frames 3 --size 64x64 --seed 4 --noise 0",)
-    assert f"wrote {out}: 3 wrist, 8 tripod" in run("simulate cell --out", out, *words).out
+    assert (
+        f"wrote {out}: 3 wrist, 8 tripod" in run("simulate cell --out", out, *words).out
+    )
     shutil.rmtree(out)
     report = run.json("simulate cell --out", out, *words)
     assert (report["scenes"], report["frames"]) == ([str(out / "wrist")], 3 + 8 + 25)

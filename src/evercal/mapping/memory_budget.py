@@ -66,7 +66,7 @@ class MemoryBudget:
             return cls(least=FEW_KEYFRAMES)
         if isinstance(memory, int):
             return cls(share=0.0, least=memory)
-        text = memory.strip()
+        text = str(memory).strip()
         if text.lower() == AUTO:
             return cls(auto=True)
         pattern = r"(\d+(?:\.\d+)?)\s*(%|[kmg]?i?b?)"
