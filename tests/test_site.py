@@ -98,7 +98,7 @@ def test_start_page_is_the_readme_and_its_links_stay_inside(site: Path) -> None:
     assert 'href="results.html"' in start
     assert 'href="contributing.html"' in start
     assert 'href="files/src/evercal/features/weights/pretrain.log"' in start
-    assert 'href="../index.html"' in (site / "tutorials" / "fleet.html").read_text(
+    assert 'href="../index.html"' in (site / "tutorials" / "fixed-camera.html").read_text(
         encoding="utf-8"
     )
 
