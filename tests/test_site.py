@@ -98,9 +98,9 @@ def test_start_page_is_the_readme_and_its_links_stay_inside(site: Path) -> None:
     assert 'href="results.html"' in start
     assert 'href="contributing.html"' in start
     assert 'href="files/src/evercal/features/weights/pretrain.log"' in start
-    assert 'href="../index.html"' in (site / "tutorials" / "fixed-camera.html").read_text(
-        encoding="utf-8"
-    )
+    assert 'href="../index.html"' in (
+        site / "tutorials" / "fixed-camera.html"
+    ).read_text(encoding="utf-8")
 
 
 def test_drawings_are_made_by_their_command(tmp_path: Path) -> None:
