@@ -316,7 +316,9 @@ def test_a_body_ends_with_the_message_that_says_no_more():
 def test_answers_are_sent_at_once(hall_service):
     # With Nagle's algorithm, those on a connection that stays open wait for the client's delayed
     # acknowledgement.
-    with hall_service.connected(b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n") as ours:
+    with hall_service.connected(
+        b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    ) as ours:
         assert ours.recv(100)
         for connection in hall_service.connections:
             own = connection.transport.get_extra_info("socket")
