@@ -89,8 +89,8 @@ def test_samples_are_on_disk_at_once_and_a_new_studio_goes_on(cell, tmp_path):
     ]
     assert studio.next_view() is None
     studio.connection.look()
-    assert status(studio, "1 Connect") == "done"
-    assert "take the first sample" in says(studio, "2 Record")
+    assert status(studio, "Connect") == "done"
+    assert "take the first sample" in says(studio, "Record")
     assert studio.take_sample() == "Took sample 0000.jpg."
     assert len(load_recording(tmp_path / "wrist").train) == 1
     assert "same pose as 0000.jpg: better remove it" in studio.take_sample()
@@ -99,7 +99,7 @@ def test_samples_are_on_disk_at_once_and_a_new_studio_goes_on(cell, tmp_path):
     assert again.remove(*again.bad_samples()) == "Removed 0001.jpg."
     assert again.remove(*again.bad_samples()) == "There is no such sample."
     assert [f.name for f in load_recording(tmp_path / "wrist").train] == ["0000.jpg"]
-    assert status(again, "3 Learn") == "waits"
+    assert status(again, "Learn") == "waits"
 
 
 def test_the_next_view_is_reachable_lowers_sigma_and_is_not_repeated(cell, tmp_path):
@@ -173,7 +173,7 @@ def test_recording_by_itself_ends_complete_or_when_it_is_stopped(cell, tmp_path)
     studio.record(silent)
     covered = studio.coverage()
     assert (covered.ready, covered.missing) == (True, ())
-    assert (status(studio, "2 Record"), status(studio, "3 Learn")) == ("done", "to do")
+    assert (status(studio, "Record"), status(studio, "Learn")) == ("done", "to do")
 
 
 def test_devices_that_give_nothing_are_named(cell, tmp_path):
@@ -186,7 +186,7 @@ def test_devices_that_give_nothing_are_named(cell, tmp_path):
     connection.look()
     assert "wrist" in connection.images
     assert "poses.csv" in connection.problems["robot"]
-    assert "poses.csv" in says(studio, "1 Connect")
+    assert "poses.csv" in says(studio, "Connect")
     (tmp_path / "poses.csv").write_text("x,y,z,qw,qx,qy,qz\n0.4,0,0.5,1,0,0,0\n")
     connection.look(None)
     assert connection.complete
@@ -257,7 +257,7 @@ def test_samples_learned_again_replace_their_scene_and_no_other(
         assert opened.scenes == ("wrist", "wrist-2", "wrist-3")
         again = studio_in(tmp_path, cell)
         assert (again.scene, again.samples_changed()) == ("wrist-3", False)
-        assert status(again, "3 Learn") == "done"
+        assert status(again, "Learn") == "done"
         os.utime(tmp_path / "wrist" / "base_from_gripper.csv")  # the same samples
         assert not again.samples_changed()
         again.take_sample()
@@ -280,11 +280,12 @@ def test_a_held_thing_leads_from_an_empty_folder_to_the_fixed_camera(tmp_path):
     studio = studio_in(tmp_path, cell, wrist_camera=None)
     truth = cell.truth.base_from_tripod
     studio.connection.look("fixed")
-    assert status(studio, "1 Connect") == "done"
+    assert status(studio, "Connect") == "done"
     frames = studio.recorders["fixed"]
     studio.record(silent, lambda: len(frames.frames) == 8, "fixed")
     studio.remove("0007.jpg", which="fixed")
-    assert "1 more images to start with" in says(studio, "or Hold")
+    assert "1 more image to start with" in says(studio, "Hold")
+    assert "cannot be calibrated yet" in says(studio, "Hold")
     studio.record(silent, lambda: len(frames.frames) == 12, "fixed")
     assert studio.coverage("fixed").ready
     assert (
@@ -292,7 +293,7 @@ def test_a_held_thing_leads_from_an_empty_folder_to_the_fixed_camera(tmp_path):
         == f"Learned 12 images; wrote {tmp_path}/fixed.json."
     )
     again = studio_in(tmp_path, cell, wrist_camera=None)
-    assert [status(again, step) for step in ("4 Fixed", "or Hold")] == ["done", "done"]
+    assert [status(again, step) for step in ("Fixed", "Hold")] == ["done", "done"]
     again.export("fixed", "easy_handeye2", NAMES)
     found = read_calibration(tmp_path / "fixed.json")
     assert found.frames == NAMES
@@ -346,7 +347,7 @@ def test_every_format_is_exported_or_says_why_not(cell, tmp_path):
             written.append(studio.export("fixed", name))
     # Each has a file of its own.
     assert len(set(written)) == len(FORMATS) - len(NEEDING_MORE)
-    assert status(studio, "5 Export") == "done"
+    assert status(studio, "Export") == "done"
 
 
 def ended(tasks: Tasks) -> None:
@@ -390,7 +391,6 @@ def test_the_page_follows_a_task(cell, tmp_path, caplog):
         assert page.tasks.message == "Took sample 0000.jpg."
         page.studio.connection.look("fixed")
         page.refresh()
-        assert page.controls.which == "wrist"
     finally:
         page.close()
     assert caplog.records == []

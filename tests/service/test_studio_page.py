@@ -68,7 +68,7 @@ def test_from_an_empty_folder_to_both_calibrations(browser, tmp_path):
 def record(visit: Any, root: Path) -> None:
     """By button and by key, then by itself."""
     seen_until(visit, "Images and gripper poses arrive.")
-    click(visit, "2 Record", "tab")
+    click(visit, "Record", "tab")
     click(visit, "Take sample")
     seen_until(visit, "Took sample 0000.jpg.")
     visit.keyboard.press("m")
@@ -85,10 +85,10 @@ def record(visit: Any, root: Path) -> None:
 
 def calibrate(visit: Any, root: Path) -> None:
     """Learn, calibrate and check the fixed camera, export both."""
-    click(visit, "3 Learn", "tab")
+    click(visit, "Learn", "tab")
     click(visit, "Learn the recording")
     seen_until(visit, "wrist.json.", 1200)
-    click(visit, "4 Fixed", "tab")
+    click(visit, "Fixed", "tab")
     click(visit, "Take 8 images")
     seen_until(visit, "Took 8 images.", 600)
     click(visit, "Calibrate")
@@ -96,7 +96,7 @@ def calibrate(visit: Any, root: Path) -> None:
     click(visit, "Check")
     seen_until(visit, "The camera has not moved")
     shot(visit, "fixed")
-    click(visit, "5 Export", "tab")
+    click(visit, "Export", "tab")
     click(visit, "Export file")
     seen_until(visit, "the base frame is unknown")
     visit.locator("input[value='easy_handeye2']:not([type=hidden])").last.click()

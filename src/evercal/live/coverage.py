@@ -189,7 +189,7 @@ def _missing(
 ) -> Strings:
     missing = []
     if good < MIN_GRIPPER_FRAMES:
-        missing.append(f"{MIN_GRIPPER_FRAMES - good} more images to start with")
+        missing.append(f"{_more(MIN_GRIPPER_FRAMES - good)} to start with")
     # Two axes of rotation are necessary, the third one makes the result better.
     rotations_left = _uncovered(rotations)
     if rank < 2 and not rotations_left:
@@ -202,8 +202,14 @@ def _missing(
             wanted = f"{axis.spread:.0f} {unit}, {least:.0f} wanted"
             missing.append(f"{what} {axis.name} ({wanted})")
     if MIN_GRIPPER_FRAMES <= good < IMAGES:
-        missing.append(f"{IMAGES - good} more images")
+        missing.append(_more(IMAGES - good))
     return tuple(missing)
+
+
+def _more(images: int) -> str:
+    if images == 1:
+        return "1 more image"
+    return f"{images} more images"
 
 
 def _uncovered(axes: Sequence[AxisCoverage]) -> list[AxisCoverage]:

@@ -3,6 +3,7 @@
 import logging
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from evercal.calibration.export.formats import FORMATS
 from evercal.calibration.from_map.next_views import NextViews
 from evercal.errors import InputError
 from evercal.live.coverage import POSITION_MM, ROTATION_DEG
+from evercal.reports.overlay import resized
 from evercal.robot.frame_names import FrameNames
 from evercal.service.studio.devices import Which
 from evercal.service.studio.steps import STEPS
@@ -27,6 +29,8 @@ from evercal.typing import Strings
 
 _CAMERAS: dict[str, Which] = {"camera on the gripper": "wrist", "fixed camera": "fixed"}
 """Cameras by their labels."""
+_PICTURE_PX = 480
+"""Width of the pictures."""
 
 
 class Tasks:
@@ -90,11 +94,8 @@ class Controls:
         self._view: NextViews | None = None
         self._updates: list[Callable[[], None]] = []
         """Calls that bring single controls up to date."""
+        self._pictures: list[tuple[Which, viser.GuiImageHandle]] = []
         gui = self._gui
-        cameras = studio.connection.devices.cameras
-        labels = [label for label, which in _CAMERAS.items() if which in cameras]
-        self._camera = gui.add_dropdown("Camera", labels)
-        self._picture = gui.add_image(np.zeros((3, 4, 3), np.uint8))
         self._keep(gui.add_html(""), content=self._message)
         bar = gui.add_progress_bar(0.0, animated=True)
         self._keep(bar, visible=lambda: tasks.busy, value=lambda: 100 * tasks.progress)
@@ -115,11 +116,6 @@ class Controls:
                 )
                 add()
 
-    @property
-    def which(self) -> Which:
-        """The camera whose picture is shown."""
-        return _CAMERAS[chosen(self._camera)]
-
     def show(self, next_view: NextViews | None) -> None:
         """Show the state of the steps and of the task that runs."""
         self._view = next_view
@@ -127,33 +123,62 @@ class Controls:
             update()
 
     def show_live(self) -> None:
-        """Show what arrives from the chosen camera and the robot."""
+        """Show what arrives from cameras and robot."""
         connection = self._studio.connection
-        if self.which in connection.images:
-            self._picture.image = connection.images[self.which]
+        for which, picture in self._pictures:
+            if which in connection.images:
+                picture.image = resized(connection.images[which], _PICTURE_PX)
+                picture.visible = True
         rows = [(f"{name}: no data", why) for name, why in connection.problems.items()]
         if connection.base_from_gripper is not None:
             rows.append(("gripper", position_mm(connection.base_from_gripper)))
         self._arrives.content = rows_html(rows)
 
+    def _picture(self, which: Which) -> None:
+        nothing = np.zeros((3, 4, 3), np.uint8)
+        picture = self._gui.add_image(nothing, visible=False)
+        self._pictures.append((which, picture))
+
     def _connect(self) -> None:
         self._arrives = self._gui.add_html("")
+        for which in _CAMERAS.values():
+            self._picture(which)
 
     def _samples(self, which: Which = "wrist") -> None:
         studio = self._studio
         gui = self._gui
         tasks = self._tasks
         take, move = ("T", "M") if which == "wrist" else (None, None)
-        self._button("Take sample", lambda: studio.take_sample(which), take)
+
+        def few() -> bool:
+            return not studio.coverage(which).ready
+
+        def by_hand() -> bool:
+            return few() and not studio.can_move
+
+        self._picture(which)
         if studio.can_move:
-            self._button("Move there", lambda: studio.move_on(which), move)
             self._button(
                 "Record by itself",
                 lambda: studio.record(tasks.step, tasks.stop.is_set, which),
+                first=few,
             )
-            gui.add_button("Stop", color="red").on_click(lambda _: tasks.stop.set())
+            stop = gui.add_button("Stop", color="red")
+            stop.on_click(lambda _: tasks.stop.set())
+            self._keep(stop, disabled=lambda: not tasks.busy)
+            self._button("Move there", lambda: studio.move_on(which), move)
+        take_sample = partial(studio.take_sample, which)
+        self._button("Take sample", take_sample, take, first=by_hand)
+        if which == "fixed":
+            learn = partial(studio.learn, tasks.step, which)
+            self._button("Calibrate", learn, first=lambda: not few())
         self._keep(gui.add_html(""), content=lambda: self._coverage(which))
-        sample: Any = gui.add_dropdown("Sample", ("-",))
+        with gui.add_folder("Samples", expand_by_default=False):
+            self._removal(which)
+
+    def _removal(self, which: Which) -> None:
+        studio = self._studio
+        sample: Any = self._gui.add_dropdown("Sample", ("-",))
 
         def names() -> Strings:
             frames = reversed(studio.recorders[which].frames)
@@ -174,33 +199,35 @@ class Controls:
         self._button("Remove all", lambda: studio.remove(*names(), which=which))
 
     def _learn(self) -> None:
-        self._button(
-            "Learn the recording", lambda: self._studio.learn(self._tasks.step)
-        )
+        learn = partial(self._studio.learn, self._tasks.step)
+        self._button("Learn the recording", learn, first=lambda: True)
         self._keep(self._gui.add_html(""), content=lambda: self._numbers("wrist"))
 
     def _fixed(self) -> None:
         studio = self._studio
         gui = self._gui
         step = self._tasks.step
+        self._picture("fixed")
         moves = studio.can_move
         move = gui.add_checkbox("Move the arm between images", moves, visible=moves)
 
         def images() -> str:
             return rows_html([("images", str(len(studio.fixed_images)))])
 
-        series = f"Take {FIXED_IMAGES} images"
+        self._button(
+            f"Take {FIXED_IMAGES} images",
+            lambda: studio.take_fixed_series(step, move.value),
+            first=lambda: not studio.fixed_images,
+        )
         self._button("Take image", studio.take_fixed)
-        self._button(series, lambda: studio.take_fixed_series(step, move.value))
-        self._button("Calibrate", lambda: studio.calibrate_fixed(step))
+        calibrate = partial(studio.calibrate_fixed, step)
+        self._button("Calibrate", calibrate, first=lambda: bool(studio.fixed_images))
         self._button("Check", studio.check_fixed)
-        self._button("Remove all images", studio.clear_fixed)
         self._keep(gui.add_html(""), content=lambda: images() + self._numbers("fixed"))
+        self._button("Remove all images", studio.clear_fixed)
 
     def _hold(self) -> None:
-        studio = self._studio
         self._samples("fixed")
-        self._button("Calibrate", lambda: studio.learn(self._tasks.step, "fixed"))
         self._keep(self._gui.add_html(""), content=lambda: self._numbers("fixed"))
 
     def _export(self) -> None:
@@ -216,7 +243,7 @@ class Controls:
             names = FrameNames(*(field.value.strip() for field in fields))
             return self._studio.export(_CAMERAS[chosen(camera)], chosen(format), names)
 
-        self._button("Export file", export)
+        self._button("Export file", export, first=lambda: True)
 
     def _keep(self, handle: Any, **properties: Callable[[], Any]) -> None:
         def update() -> None:
@@ -225,13 +252,25 @@ class Controls:
 
         self._updates.append(update)
 
-    def _button(self, label: str, task: Callable[[], str], key: Any = None) -> None:
+    def _button(
+        self,
+        label: str,
+        task: Callable[[], str],
+        key: Any = None,
+        first: Callable[[], bool] = bool,
+    ) -> None:
+        """A grey button; `first` says when it is the one that leads on."""
+
         def start(_: object) -> None:
             self._tasks.start(f"{label.lower()} ...", task)
 
         button = self._gui.add_button(label, hint=key and f"Key {key}")
         button.on_click(start)
-        self._keep(button, disabled=lambda: self._tasks.busy)
+        self._keep(
+            button,
+            disabled=lambda: self._tasks.busy,
+            color=lambda: None if first() else "gray",
+        )
         if key is not None:
             self._gui.add_command(label, hotkey=key).on_trigger(start)
 

@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from contextlib import suppress
+from itertools import cycle
 
 import numpy as np
 import viser
@@ -86,11 +87,12 @@ class StudioPage:
         """Show live images while the page is open somewhere; a task takes its own images."""
         connection = self.studio.connection
         complete = False
+        turns = cycle(connection.devices.cameras)
         while not self._closed.wait(_LIVE_S):
             if not self.server.get_clients():
                 continue
             try:
-                which = self.controls.which
+                which = next(turns)
                 wanted = connection.devices.live and not self.tasks.busy
                 if wanted or which not in connection.images:
                     connection.look(which)

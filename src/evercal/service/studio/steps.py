@@ -29,7 +29,7 @@ def _record(studio: Studio) -> State:
             return "done", covered.verdict
         return "to do", covered.verdict
     if studio.connection.devices.wrist_camera is None:
-        return "waits", "No camera on the gripper was given; go on to 'or Hold'."
+        return "waits", "No camera on the gripper was given; go on to 'Hold'."
     if not studio.connection.complete:
         return "waits", "Connect the camera and the robot first."
     return (
@@ -60,7 +60,7 @@ def _fixed(studio: Studio) -> State:
     if not studio.cell.scenes:
         return (
             "waits",
-            "Learn the scene first, or let the gripper hold something: see 'or Hold'.",
+            "Learn the scene first, or let the gripper hold something: see 'Hold'.",
         )
     if studio.connection.devices.fixed_camera is None:
         return "waits", _NO_FIXED
@@ -77,7 +77,7 @@ def _hold(studio: Studio) -> State:
     if studio.connection.devices.fixed_camera is None:
         return "waits", _NO_FIXED
     if covered.samples:
-        return "to do", covered.verdict
+        return "to do", covered.verdict.replace("be learned", "be calibrated")
     return "to do", (
         "Calibrates the fixed camera without a scene. The gripper holds a textured thing, such as a"
         f" box or a book, and turns it by 20° and more about two axes: {MIN_GRIPPER_FRAMES} images"
@@ -95,11 +95,11 @@ def _export(studio: Studio) -> State:
 
 
 STEPS: dict[str, Callable[[Studio], State]] = {
-    "1 Connect": _connect,
-    "2 Record": _record,
-    "3 Learn": _learn,
-    "4 Fixed": _fixed,
-    "or Hold": _hold,
-    "5 Export": _export,
+    "Connect": _connect,
+    "Record": _record,
+    "Learn": _learn,
+    "Fixed": _fixed,
+    "Hold": _hold,
+    "Export": _export,
 }
-"""All steps in order, each with its state; a held thing stands in for steps 2 to 4."""
+"""All steps in order, each with its state; `Hold` stands in for the three before it."""

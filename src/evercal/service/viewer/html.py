@@ -43,7 +43,7 @@ def rows_html(rows: Sequence[tuple[str, str]]) -> str:
         return ""
     html = f'<div style="{_TEXT}"><table style="width:100%">'
     for name, value in rows:
-        html += f'<tr><td style="width:40%;vertical-align:top">{escape(name)}</td>'
+        html += f'<tr><td style="width:46%;vertical-align:top">{escape(name)}</td>'
         html += f"<td>{escape(with_options(value))}</td></tr>"
     return html + "</table></div>"
 
