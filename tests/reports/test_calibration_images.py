@@ -180,12 +180,12 @@ def test_lines_lead_from_the_detections_to_the_projections(tmp_path: Path) -> No
     own = calibration({"a.png": True})
     localizer: Any = FixedLocalizer(BASE_FROM_CAMERA)
     [image] = drawn_in(own, tmp_path, localizer)
-    assert image.summary.endswith("lines 1 times as long")
+    assert image.summary.endswith("lines 2 times as long")
     # The second landmark is seen 24 pixels of the page right of its projection.
     [(x, y)] = CAMERA.resized(640, 480).project([[0.2, -0.1, 1.0]]).round().astype(int)
     red, _, blue = image.image[y].astype(int).T
     orange = np.flatnonzero(red - blue > 100)
-    assert orange.min() == pytest.approx(x, abs=2)
+    assert orange.min() == pytest.approx(x + 24 - 2 * 24, abs=2)
     # With the radius of the yellow dot.
     assert orange.max() == pytest.approx(x + 24 + 3, abs=2)
 

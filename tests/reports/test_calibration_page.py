@@ -172,8 +172,12 @@ def test_transform_is_complete() -> None:
     reader, _ = read(full())
     assert "pose of camera_optical in panda_link0" in reader.text("p")
     assert "takes points from camera_optical to panda_link0" in reader.text("p")
-    numbers = reader.row("quaternion x, y, z, w")[1].split(", ")
-    assert numbers == [f"{value:.8f}" for value in (1, 0, 0, 0)]
+    for order, numbers in (
+        ("w, x, y, z", (0, 1, 0, 0)),
+        ("x, y, z, w (ROS)", (1, 0, 0, 0)),
+    ):
+        shown = reader.row(f"quaternion {order}")[1].split(", ")
+        assert shown == [f"{value:.8f}" for value in numbers]
     assert reader.row("translation x, y, z (mm)")[1] == "100.000, 50.000, 1000.000"
     matrix = np.array(reader.text("pre").split(), float).reshape(4, 4)
     assert matrix == pytest.approx(POSE.matrix())
@@ -197,7 +201,7 @@ def test_checks_ellipsoid_and_source_are_shown() -> None:
         ("image size (px)", "160x120"),
         ("fx (px)", "150.0000"),
         ("k1", "0.1000"),
-        ("repeatability (mm)", "0.31"),
+        ("two halves of the data differ by (mm)", "0.31"),
     ):
         assert reader.row(name)[1] == value
     assert page.missing == ()
@@ -206,6 +210,27 @@ def test_checks_ellipsoid_and_source_are_shown() -> None:
         *reader.text("text").splitlines()
     }
     assert "lens: intrinsics" in page.html
+
+
+def test_the_independent_check_is_named_or_what_to_do_for_one() -> None:
+    reader, _ = read(full(checks=Checks.from_dict({"held_out_mm": 0.284})))
+    assert "left out are predicted within 0.28 mm (median)" in reader.text("p")
+    for page in (reader, read(solved())[0]):
+        assert "run 'evercal verify c.json'" in " ".join(page.text("p").split())
+
+
+def test_the_ellipsoid_is_smaller_than_the_camera_that_it_surrounds() -> None:
+    """Whatever its size, in views along the same axes."""
+    for metres in (1e-5, 3e-4, 2e-3):
+        own = full(
+            covariance=np.diag([*[metres**2, metres**2, 9 * metres**2], 0, 0, 0])
+        )
+        panels, _ = camera_views(own, Surroundings())
+        for panel, plane in zip(panels, ("xy", "xz"), strict=True):
+            assert [label[0] for label in panel.labels] == list(plane)
+            (area,) = (s.points for s in panel.shapes if s.kind == "area")
+            camera = next(s.points for s in panel.shapes if s.width == 2.2)
+            assert np.ptp(area, axis=0).max() <= np.ptp(camera, axis=0).max()
 
 
 def test_missing_contents_are_listed() -> None:
@@ -217,8 +242,7 @@ def test_missing_contents_are_listed() -> None:
         "No pictures",
         "No list of images",
         "No error budget",
-        "No repeatability",
-        "No held-out error",
+        "No held-out error or repeatability",
         "No intrinsics",
     }
     assert reader.text("li").splitlines() == list(page.missing)

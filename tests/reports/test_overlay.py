@@ -79,13 +79,26 @@ def test_a_legend_is_drawn_where_there_is_room(shape: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("length", "times"), [(0.1, 100), (0.6, 20), (2.4, 10), (26.0, 1), (np.nan, 1)]
+    ("length", "times"), [(0.1, 100), (0.6, 50), (2.4, 20), (51.0, 1), (np.nan, 1)]
 )
 def test_lines_are_exaggerated_by_a_round_factor(length: float, times: int) -> None:
     vectors = np.full((20, 2), length / 2**0.5)
     assert exaggeration(vectors) == times
     vectors[0] = 500.0  # an outlier does not shorten the others
     assert exaggeration(vectors) == times
+
+
+def test_one_line_is_drawn_in_each_part_of_an_image() -> None:
+    """A pattern shows; all landmarks have a dot."""
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform([0, 0], [640, 480], (900, 2))
+    nothing = np.zeros((480, 640, 3), np.uint8)
+    vectors = np.tile([0.0, 2.0], (900, 1))
+    drawn, times = draw_residuals(nothing, pixels, vectors, np.full(900, 0.1), 2.0)
+    assert times == 20
+    orange = (drawn == (255, 140, 40)).all(-1).astype(np.uint8)
+    lines = cv2.connectedComponents(orange)[0] - 1
+    assert 80 < lines < 140 * 2  # some lie behind the dots of others
 
 
 def test_lines_have_their_colour_and_gaps() -> None:

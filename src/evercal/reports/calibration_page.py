@@ -41,6 +41,11 @@ from evercal.typing import Strings
 
 _VIEW_PX = (420, 400)
 """Width and height of a view from above or from the side."""
+_SIDE = (0, 2)
+"""Axes of the view from the side."""
+_ELLIPSOID = 0.015
+"""Longest standard deviation as drawn, relative to the extent of a view: the ellipsoid of 95 % is
+half as long as the camera."""
 _BARS_PX = (850, 120)
 """Width and height of a chart of residuals."""
 
@@ -119,6 +124,7 @@ def calibration_page(
         same_map &= older.calibration.source.get("map") == digest
     html = render(
         "calibration.html",
+        name=file.name,
         title=f"{file.name}: {calibration.parent_frame}_from_{calibration.child_frame}",
         calibration=calibration,
         parent=calibration.parent_frame,
@@ -193,14 +199,13 @@ def _origin(calibration: Calibration) -> str:
 
 def _missing(calibration: Calibration) -> list[str]:
     checks = calibration.checks
-    halves = checks.repeatability_mm is not None
-    held_out = checks.held_out_mm is not None
+    split = (checks.repeatability_mm, checks.held_out_mm)
     parts = {
         "No uncertainty: the calibration states none.": has_uncertainty(calibration),
         "No list of images: the calibration holds none.": calibration.images,
         "No error budget: the calibration holds none.": calibration.error_terms,
-        "No repeatability: two halves of the data were not compared.": halves,
-        "No held-out error: no data were held out.": held_out,
+        "No held-out error or repeatability: all data were used together.": split
+        != (None, None),
         "No intrinsics: the calibration holds none.": calibration.camera,
     }
     return [sentence for sentence, part in parts.items() if not part]
@@ -212,18 +217,17 @@ def camera_views(calibration: Calibration, around: Surroundings) -> Chart:
     parent = calibration.parent_frame
     ends = np.stack([np.zeros(3), pose.pose.translation_m])
     extent = float(np.ptp(around.bounds(ends), axis=0).max())
-    times = readable_scale([Ellipsoid.of(pose)], 0.07 * extent)
+    times = readable_scale([Ellipsoid.of(pose)], _ELLIPSOID * extent)
     covariance = pose.covariance[:3, :3]
     variances, directions = np.linalg.eigh(covariance)
     half = times * np.sqrt(CHI2_95 * np.diag(covariance).clip(0))
     ellipsoid = [ends[1] - half, ends[1] + half]
     seen = np.concatenate([ends, ellipsoid])
-    width, depth, _ = np.ptp(around.bounds(seen), axis=0)
     view = None
     if calibration.camera is not None:
         view = Frustum.of(pose.pose, calibration.camera)
     panels = []
-    for plane in (ABOVE, (int(depth > width), 2)):  # from the wider side
+    for plane in (ABOVE, _SIDE):
         shape = Shape("area", ellipse(pose, times, plane), "orange", opacity=0.3)
         axes = Axes(plane, parent)
         panels.append(

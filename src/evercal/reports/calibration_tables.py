@@ -189,7 +189,7 @@ def _cell(value: object) -> str:
     if isinstance(value, str):
         return value
     if isinstance(value, float):
-        return f"{value:.6g}"
+        return f"{value:.4g}"
     return json.dumps(value)
 
 

@@ -36,7 +36,9 @@ _FONT = 0
 """cv2.FONT_HERSHEY_SIMPLEX; OpenCV is imported inside functions only."""
 _MARGIN = 6
 """Around the legend, pixels."""
-_VECTOR_PX = 25.0
+_VECTORS = 12
+"""Residual vectors side by side in an image, at most."""
+_VECTOR_PX = 50.0
 """Length of long residual vectors as drawn, pixels."""
 _VECTOR_COLOUR = (255, 140, 40)
 """Orange, RGB."""
@@ -107,15 +109,24 @@ def draw_residuals(
 ) -> tuple[Image, int]:
     """Draw detections (n, 2) and residual vectors (n, 2) over a grey copy of an image.
 
-    Detections that are not finite are omitted. `residuals` (n,) are those of the legend, in any
+    Vectors are drawn of one detection in each part of the image. Detections that are not finite are
+    omitted. `residuals` (n,) are those of the legend, in any
     unit of pixels, NaN without a projection. Returns the factor that enlarges the vectors, too.
     """
     import cv2
 
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     drawn = np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
-    limits = (0.0, largest)
     width = image.shape[1]
+    cells = np.round(pixels * _VECTORS / width)
+    chosen = np.unique(cells, axis=0, return_index=True)[1]
+    vectors = vectors[chosen]
+    times = exaggeration(vectors)
+    starts = pixels[chosen]
+    lines = np.stack([starts, starts + times * vectors], 1)
+    inks = [_VECTOR_COLOUR] * len(lines)
+    drawn = overlay_lines(drawn, lines, inks, 2)
+    limits = (0.0, largest)
     radius = round(max(2.0, width / 180) * _FRACTIONS)
     visible = (np.abs(pixels) < 1e5).all(axis=1)
     fixed = np.round(pixels[visible] * _FRACTIONS)
@@ -131,11 +142,6 @@ def draw_residuals(
             cv2.LINE_AA,
             _FRACTION_BITS,
         )
-    times = exaggeration(vectors)
-    ends = pixels + times * vectors
-    lines = np.stack([pixels, ends], 1)
-    inks = [_VECTOR_COLOUR] * len(lines)
-    drawn = overlay_lines(drawn, lines, inks, 1)
     _draw_legend(drawn, "residual (px)", limits)
     return drawn, times
 

@@ -23,7 +23,7 @@ from evercal.service.viewer.drawing import (
     add_frustum,
     place,
 )
-from evercal.service.viewer.html import AMBER, BLUE, GREEN, RED
+from evercal.service.viewer.html import AMBER, BLUE, GREEN, PALE, RED
 from evercal.service.viewer.page import start_server
 
 _LIVE_S = 0.25
@@ -141,7 +141,7 @@ class _Drawing:
             joints = np.vstack([np.zeros(3), arm()])
             pairs = np.stack([joints[:-1], joints[1:]], axis=1).astype(np.float32)
             self._server.scene.add_line_segments(
-                "/arm", pairs, (203, 213, 225), thickness=8.0, thickness_units="screen"
+                "/arm", pairs, PALE, thickness=8.0, thickness_units="screen"
             )
 
     def show_samples(self, next_view: NextViews | None) -> None:
