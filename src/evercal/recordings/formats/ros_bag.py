@@ -30,7 +30,8 @@ from evercal.recordings.formats.bags.file import (
     BagFile,
     is_bag,
 )
-from evercal.recordings.formats.bags.poses import plain_name, poses_at_images
+from evercal.recordings.formats.bags.poses import poses_at_images
+from evercal.recordings.formats.bags.tf_tree import plain_name
 from evercal.recordings.frame import Frame, Recording, lost_images
 from evercal.recordings.images import (
     ImageFile,

@@ -2,213 +2,25 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, NoReturn
+from typing import Literal, NoReturn
 
 import numpy as np
 
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
-from evercal.geometry import SE3
 from evercal.recordings.formats.bags.file import JOINT_STATE, TF, BagFile
+from evercal.recordings.formats.bags.tf_tree import (
+    BASES,
+    GRIPPERS,
+    STATIC,
+    TfTree,
+)
 from evercal.recordings.poses.joint_tables import interpolate, poses_of_arm
-from evercal.recordings.poses.pose_track import PoseTrack
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.frame_names import FrameNames
 from evercal.robot.robot_model import RobotModel
-from evercal.typing import Array, BoolArray, IntArray, Strings
-
-_BASES = (
-    "base_link",
-    "base",
-    "panda_link0",
-    "fr3_link0",
-    "fer_link0",
-    "lbr_link_0",
-    "link_base",
-)
-"""Usual names of the robot's base."""
-_GRIPPERS = (
-    "tool0",
-    "flange",
-    "ee_link",
-    "panda_hand",
-    "fr3_hand",
-    "fer_hand",
-    "lbr_link_ee",
-    "link_eef",
-    "gripper_link",
-    "tool_link",
-)
-"""Usual names of the gripper."""
-_LENGTH_TOLERANCE = 1e-2
-"""Largest deviation of the length of a quaternion from 1."""
-
-
-class _Transform(NamedTuple):
-    """One TransformStamped, parent_from_child."""
-
-    parent: str
-    child: str
-    stamp_s: float | None
-    """None if static."""
-    quaternion: tuple[float, ...]
-    """w, x, y, z."""
-    translation: tuple[float, ...]
-    """Metres."""
-
-    def is_rigid(self) -> bool:
-        """Whether the numbers are a rotation and a translation."""
-        deviation = abs(float(np.linalg.norm(self.quaternion)) - 1)
-        return bool(
-            deviation < _LENGTH_TOLERANCE and np.isfinite(self.translation).all()
-        )
-
-
-@dataclass
-class _Edge:
-    """Transforms of one child frame from one topic; moving ones take precedence."""
-
-    moving: list[_Transform] = field(default_factory=list)
-    static: list[_Transform] = field(default_factory=list)
-
-    @property
-    def transforms(self) -> list[_Transform]:
-        """The moving ones, or the last static one."""
-        return self.moving or self.static[-1:]
-
-    @property
-    def parent(self) -> str:
-        """The frame of the first transform."""
-        return self.transforms[0].parent
-
-    @property
-    def parents(self) -> set[str]:
-        """The frames of all transforms."""
-        return {transform.parent for transform in (*self.moving, *self.static)}
-
-
-class _TfTree:
-    """Transforms, added in any order; `topic` is used if several topics move one frame."""
-
-    def __init__(self, source: str, topic: str | None = None) -> None:
-        self._source = source
-        self._topic = topic
-        self._edges: dict[str, dict[str, _Edge]] = {}  # by child and topic
-
-    def add(self, transform: _Transform, topic: str) -> None:
-        """Add a transform of a topic; /tf_static belongs to /tf."""
-        parent = plain_name(transform.parent)
-        child = plain_name(transform.child)
-        if not transform.is_rigid():
-            raise InputError(
-                f"{self._source}: tf {parent} -> {child}: quaternion (w x y z)"
-                f" {transform.quaternion}, translation {transform.translation}: no rigid transform;"
-                f" repair the program that publishes it"
-            )
-        edge = self._edges.setdefault(child, {}).setdefault(topic, _Edge())
-        transforms = edge.static if transform.stamp_s is None else edge.moving
-        transforms.append(transform._replace(parent=parent, child=child))
-
-    def frames(self) -> Strings:
-        """All frames, parents before children."""
-        frames = {*self._edges}
-        for topics in self._edges.values():
-            for edge in topics.values():
-                frames |= edge.parents
-        return tuple(sorted(frames, key=lambda frame: (len(self._chain(frame)), frame)))
-
-    def root(self, frame: str) -> str:
-        """The frame above a frame that has no parent."""
-        return self._chain(frame)[-1]
-
-    def a_from_b(self, a: str, b: str, stamps_s: Array) -> tuple[SE3, BoolArray]:
-        """Interpolate (n,) poses of frame b in frame a, and whether each is valid."""
-        chain_a = self._chain(a)
-        chain_b = self._chain(b)
-        for child in (*chain_a, *chain_b):
-            if child in self._edges:
-                self._refuse_ambiguous(child)
-        if chain_a[-1] != chain_b[-1]:
-            raise InputError(
-                f"{self._source}: tf has no chain between {a!r} and {b!r}: their roots are"
-                f" {chain_a[-1]!r} and {chain_b[-1]!r}; record the transform that joins them"
-            )
-        shared = {*chain_a}.intersection(chain_b)
-        valid = np.ones(len(stamps_s), bool)
-        sides = []
-        for chain in (chain_a, chain_b):
-            ancestor_from_frame = SE3.identity((len(stamps_s),))
-            for child in chain:
-                if child not in shared:
-                    parent_from_child, is_valid = self._parent_from(child, stamps_s)
-                    ancestor_from_frame = parent_from_child @ ancestor_from_frame
-                    valid &= is_valid
-            sides.append(ancestor_from_frame)
-        return sides[0].inverse() @ sides[1], valid
-
-    def _edge(self, child: str) -> _Edge:
-        topics = self._edges[child]
-        if self._topic in topics:
-            return topics[self._topic]
-        for edge in topics.values():
-            if edge.moving:
-                return edge
-        return next(iter(topics.values()))
-
-    def _refuse_ambiguous(self, child: str) -> None:
-        topics = self._edges[child]
-        edge = self._edge(child)
-        if self._topic not in topics and not _agree([*topics.values()]):
-            raise InputError(
-                f"{self._source}: tf {edge.parent} -> {child} is on several topics,"
-                f" {', '.join(sorted(topics))}; choose one with `pose_topic`"
-            )
-        if len(edge.parents) > 1:
-            raise InputError(
-                f"{self._source}: tf frame {child!r} has several parents,"
-                f" {', '.join(sorted(edge.parents))}: two programs publish it; record with one of"
-                f" them"
-            )
-
-    def _parent_from(self, child: str, stamps_s: Array) -> tuple[SE3, BoolArray]:
-        edge = self._edge(child)
-        _, _, stamps, quaternions, translations = zip(*edge.transforms, strict=True)
-        poses = SE3(np.array(quaternions), np.array(translations))
-        if edge.moving:
-            return PoseTrack(np.array(stamps), poses).at(stamps_s)
-        first = np.zeros(len(stamps_s), int)
-        return poses[first], first == 0
-
-    def _chain(self, frame: str) -> list[str]:
-        chain = [frame]
-        while chain[-1] in self._edges:
-            parent = self._edge(chain[-1]).parent
-            if parent in chain:
-                cycle = " -> ".join([*chain, parent])
-                raise InputError(f"{self._source}: tf has a cycle: {cycle}")
-            chain.append(parent)
-        return chain
-
-
-def _agree(edges: Sequence[_Edge]) -> bool:
-    """Equal static transforms agree, and one moving topic takes precedence over static ones."""
-    if len({edge.parent for edge in edges}) > 1:
-        return False
-    moving = [edge for edge in edges if edge.moving]
-    if moving:
-        return len(moving) == 1
-    numbers = []
-    for edge in edges:
-        last = edge.transforms[-1]
-        numbers.append((*last.translation, *last.quaternion))
-    return np.allclose(numbers[0], numbers, atol=1e-6)
-
-
-def plain_name(frame: str) -> str:
-    """Name of a frame without the leading slash of old ROS 1 programs."""
-    return frame.lstrip("/")
+from evercal.typing import Array, BoolArray, IntArray
 
 
 @frozen_arrays
@@ -234,8 +46,8 @@ def poses_at_images(
     if options.urdf is not None:
         return _from_joints(bag, stamps, zero, RobotModel(options.urdf), options)
     tree, times = _tf(bag, zero, options.pose_topic)
-    base = _frame(bag, tree, options.base_frame, _BASES, "base_frame")
-    gripper = _frame(bag, tree, options.gripper_frame, _GRIPPERS, "gripper_frame")
+    base = tree.frame(options.base_frame, BASES, "base_frame")
+    gripper = tree.frame(options.gripper_frame, GRIPPERS, "gripper_frame")
     poses, valid = tree.a_from_b(base, gripper, stamps)
     if not valid.any():
         _refuse_times(bag, stamps, times, "tf")
@@ -253,7 +65,7 @@ def poses_at_images(
     return ImagePoses(RobotPoses(None, None, poses, frames=names), valid, owner, notes)
 
 
-def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[_TfTree, Array]:
+def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[TfTree, Array]:
     topics = bag.topics(*TF)
     if not topics:
         joints = bag.topics(JOINT_STATE)
@@ -262,47 +74,13 @@ def _tf(bag: BagFile, zero_ns: int, wanted: str | None) -> tuple[_TfTree, Array]
             f"{bag.path}: no tf in it, so there are no gripper poses; record /tf and"
             f" /tf_static{instead}. It holds {bag.contents()}"
         )
-    moving = [topic for topic in topics if not topic.endswith("tf_static")]
+    moving = [topic for topic in topics if not topic.endswith(STATIC)]
     bag.require_topic(wanted, moving, "transforms")
-    tree = _TfTree(str(bag.path), wanted)
+    tree = TfTree(str(bag.path), wanted)
     times = []
     for message in bag.messages(topics):
-        for entry in message.content.transforms:
-            header = entry.header
-            stamp = None
-            if message.topic in moving:
-                stamp = message.seconds(header, zero_ns)
-                times.append(stamp)
-            t = entry.transform.translation
-            q = entry.transform.rotation
-            rotation = (q.w, q.x, q.y, q.z)
-            translation = (t.x, t.y, t.z)
-            frames = (header.frame_id, entry.child_frame_id)
-            link = _Transform(*frames, stamp, rotation, translation)
-            tree.add(link, message.topic.removesuffix("_static"))
+        times += tree.add_message(message, zero_ns)
     return tree, np.array(times)
-
-
-def _frame(
-    bag: BagFile, tree: _TfTree, wanted: str | None, usual: Sequence[str], option: str
-) -> str:
-    frames = tree.frames()
-    if wanted is not None:
-        name = plain_name(wanted)
-        if name not in frames:
-            raise InputError(
-                f"{bag.path}: `{option}` {wanted}: no such frame in tf; it has {', '.join(frames)}"
-            )
-        return name
-    names = [name for name in usual if name in frames]
-    if len(names) != 1:
-        choice = "no frame has a usual name"
-        if names:
-            choice = f"it may be {' or '.join(names)}"
-        raise InputError(
-            f"{bag.path}: give `{option}` ({choice}); tf has {', '.join(frames)}"
-        )
-    return names[0]
 
 
 def _refuse_times(bag: BagFile, stamps: Array, times: Array, what: str) -> NoReturn:
