@@ -44,7 +44,7 @@ VERBS = {
     ],
     "Boards and pose pairs": ["detect", "solve"],
     "Results": ["export", "report", "compare"],
-    "Recordings": ["inspect", "convert", "reconstruct", "simulate", "demo"],
+    "Recordings": ["record", "inspect", "convert", "reconstruct", "simulate", "demo"],
     "Networks": ["bench"],
 }
 """Verbs by purpose, in the order of the help. The class `Learn` of `learn` is in `learn.py`."""

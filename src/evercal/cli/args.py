@@ -1,8 +1,11 @@
 """Arguments that several verbs share, and what they stand for."""
 
+import contextlib
 import math
 import os
+import signal
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -131,6 +134,14 @@ class Verb:
             say(line)
         if then:
             print_next("evercal", *then)
+
+    def wait(self, record: object, words: str, line: str) -> None:
+        """Print a record as JSON, or words and a line, and wait for SIGTERM or Ctrl-C."""
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        with contextlib.suppress(KeyboardInterrupt):
+            self.answer(record, f"{words}; Ctrl-C ends it:", line)
+            while True:
+                time.sleep(1.0)  # Ctrl-C does not end a wait without end on Windows
 
 
 @frozen

@@ -1,6 +1,7 @@
 """`evercal export`."""
 
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +15,7 @@ from evercal.errors import InputError, printable
 
 if TYPE_CHECKING:
     from evercal.calibration.export.formats import Exported
+    from evercal.calibration.export.request import Export as Request
 
 
 @frozen
@@ -61,12 +63,14 @@ class Export(args.Verb):
     """For corrected_urdf: URDF of the arm that was recorded."""
     lerobot_calibration: args.File = None
     """For lerobot: the calibration file of the arm."""
+    publish: bool = False
+    """Publish it in ROS 2 until Ctrl-C: latched on /tf_static, and a PoseWithCovarianceStamped."""
     lerobot_motors: Annotated[Motors | None, args.shown("feetech|dynamixel")] = None
     """For lerobot: feetech (SO-100, SO-101) or dynamixel (Koch, OMX)."""
 
     def run(self) -> int:
         from evercal.calibration.export.formats import FORMATS, export_files
-        from evercal.calibration.export.request import ExportOptions
+        from evercal.calibration.export.request import ExportOptions, prepare_export
         from evercal.calibration.learned import calibration_at
 
         if self.format == "list" or (self.format is None and self.calibration is None):
@@ -78,17 +82,32 @@ class Export(args.Verb):
                 then=("export", file, "--format", "NAME"),
             )
             return 0
-        if self.format is None:
+        if self.format is None and not self.publish:
             raise InputError(
-                f"no format given; add --format NAME, one of {', '.join(FORMATS)}"
+                f"no format given; add --format NAME, one of {', '.join(FORMATS)}, or --publish"
             )
         if self.calibration is None:
             raise InputError("no calibration given; name its JSON file after 'export'")
         options = {key: getattr(self, key) for key in ExportOptions.__annotations__}
         calibration = calibration_at(self.calibration)
+        if self.format is None:
+            self._publish(prepare_export(calibration, **options))
+            return 0
         exported = export_files(calibration, self.format, self.out, **options)
         self._show(exported, calibration.verdict)
         return 0
+
+    def _publish(self, export: "Request") -> None:
+        from evercal.calibration.export.request import require_names
+        from evercal.live.ros2.publishing import PosePublisher
+
+        require_names(export.calibration, both=False)
+        publisher = PosePublisher(export.parent, export.child, static=True)
+        publisher.publish(export.calibration.uncertain_pose, time.time())
+        topics = publisher.topics
+        meaning = export.calibration.meaning
+        line = f"published {meaning}, on {' and '.join(topics)}"
+        self.wait({"topics": topics, "meaning": meaning}, line)
 
     def _show(self, exported: "Exported", verdict: str) -> None:
         calibration = exported.calibration

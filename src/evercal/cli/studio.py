@@ -17,6 +17,8 @@ _REAL = (
     "camera",
     "intrinsics",
     "poses",
+    "base_frame",
+    "gripper_frame",
     "pose_convention",
     "most_age",
     "reachable",
@@ -40,12 +42,18 @@ class Studio(PageVerb):
     map: Annotated[Positional[Path | None], args.shown("[MAP]")] = None
     """Folder of the map that learns the scene. Default: a new one in --out."""
     camera: args.Source = None
-    """Camera on the gripper: number (0) or device, address (rtsp://...), video or folder."""
+    """Camera on the gripper: number (0) or device, address (rtsp://...), topic of ROS 2
+    (ros2:/camera/image_raw), video or folder."""
     intrinsics: args.File = None
-    """Intrinsics of --camera. Default: those in --out, where it was begun before; without
-    --camera, --fixed-intrinsics."""
+    """Intrinsics of --camera. Default: those in --out, where it was begun before, or those of
+    camera_info for a topic; without --camera, --fixed-intrinsics."""
     poses: args.File = None
-    """Gripper poses: a table or JSON lines that your robot's program appends to."""
+    """Gripper poses: a table or JSON lines that your robot's program appends to, or `ros2:` for
+    those of tf."""
+    base_frame: args.Frame = None
+    """The robot's base in tf. Default: the one with a usual name."""
+    gripper_frame: args.Frame = None
+    """The gripper in tf. Default: the one with a usual name."""
     pose_convention: args.Name = None
     """Convention of --poses if its header does not state it: ur, kuka, fanuc, ..."""
     most_age: Annotated[float | None, args.shown("S")] = None
@@ -58,7 +66,8 @@ class Studio(PageVerb):
     fixed: args.Source = None
     """The fixed camera; sources as for --camera."""
     fixed_intrinsics: args.File = None
-    """Intrinsics of --fixed. Default: those of the camera on the gripper."""
+    """Intrinsics of --fixed. Default: those of camera_info for a topic, else those of the camera
+    on the gripper."""
     virtual: bool = False
     """A virtual arm with a wrist camera and a tripod camera instead of yours."""
     seed: Annotated[int, arg(metavar="I")] = 0
@@ -76,7 +85,8 @@ class Studio(PageVerb):
         page = StudioPage(Session(devices, self.out, self.map), self.host, self.port)
         try:
             url = page.server.url
-            self.wait(url, f"studio in {self.out}, where the same command continues")
+            words = f"studio in {self.out}, where the same command continues"
+            self.wait({"url": url}, words, f"  {url}")
         finally:
             page.close()
         return 0
@@ -129,28 +139,38 @@ class Studio(PageVerb):
 
     def _real(self) -> "Devices":
         """The cameras and the pose file that were named."""
-        from evercal.live.camera import StreamCamera
-        from evercal.live.robot import PoseFileRobot
+        from evercal.live.camera import open_camera
+        from evercal.live.robot import open_robot
         from evercal.recordings import read_robot_poses
         from evercal.recordings.cameras.camera_file import read_camera
         from evercal.recordings.streams import is_live
+        from evercal.robot.frame_names import FrameNames
         from evercal.service.studio.devices import Devices
 
         assert self.poses is not None, "checked before"
         convention = self.pose_convention
         fixed_intrinsics = self.fixed_intrinsics
-        wrist = None if self.camera is None else StreamCamera(self.camera)
-        fixed = None if self.fixed is None else StreamCamera(self.fixed)
+        wrist = None if self.camera is None else open_camera(self.camera)
+        fixed = None if self.fixed is None else open_camera(self.fixed)
         intrinsics = self.intrinsics
         begun = self.out / "wrist" / "camera.json"
         if intrinsics is None and self.camera is None:
             intrinsics = fixed_intrinsics
         elif intrinsics is None and begun.is_file():
             intrinsics = begun
-        if intrinsics is None:
+        first = wrist or fixed
+        if intrinsics is not None:
+            camera = read_camera(intrinsics)
+        else:
+            camera = first and first.intrinsics()
+        if camera is None:
             raise InputError(
                 "no --intrinsics FILE given: a new recording needs the intrinsics"
             )
+        named_camera = fixed_intrinsics and read_camera(fixed_intrinsics)
+        if named_camera is None and fixed is not None:
+            named_camera = fixed.intrinsics()
+        names = FrameNames(self.base_frame or "", self.gripper_frame or "")
         reachable = None
         if self.reachable is not None:
             poses = read_robot_poses(
@@ -159,10 +179,10 @@ class Studio(PageVerb):
             reachable = poses.poses
         return Devices(
             wrist_camera=wrist,
-            intrinsics=read_camera(intrinsics),
-            robot=PoseFileRobot(self.poses, convention, self.most_age),
+            intrinsics=camera,
+            robot=open_robot(self.poses, names, convention, self.most_age),
             fixed_camera=fixed,
-            fixed_intrinsics=fixed_intrinsics and read_camera(fixed_intrinsics),
+            fixed_intrinsics=named_camera,
             reachable=reachable,
             rough=args.transform_of(self.gripper_from_camera),
             live=all(map(is_live, filter(None, (self.camera, self.fixed)))),

@@ -14,6 +14,7 @@ from evercal.errors import InputError
 from evercal.reports.answers import unit_known
 
 if TYPE_CHECKING:
+    from evercal.live.ros2.publishing import PosePublisher
     from evercal.localization.tracking import TrackedFrame
 
 FEW_FRAMES = 10
@@ -34,12 +35,16 @@ class Track(args.Verb):
 
     store: args.Store
     source: Annotated[Positional[str], arg(metavar="SOURCE")]
-    """Number (0) or device of a camera, an address (rtsp://...), a video file or a folder."""
+    """Number (0) or device of a camera, an address (rtsp://...), a topic of ROS 2
+    (ros2:/camera/image_raw), a video file or a folder."""
     out: Annotated[tuple[Path, ...], args.shown("FILE...", "(default: none)")] = ()
     """Files to write: .jsonl (JSON lines), .tum or .txt (TUM)."""
     scene: args.Scenes = ()
     camera: args.File = None
-    """Intrinsics. Default: those of the camera that recorded the scene."""
+    """Intrinsics. Default: those of camera_info for a topic, else those of the camera that recorded
+    the scene."""
+    publish: Annotated[tuple[str, str] | None, args.shown("BASE CAMERA")] = None
+    """Publish the poses in ROS 2 as tf and PoseWithCovarianceStamped: names of both frames."""
     at_most: Annotated[float | None, args.shown("MS")] = None
     """Time for a frame, milliseconds. What was left out is in the answer (`omitted`)."""
     smooth: Annotated[float, arg(metavar="SECONDS")] = 0.0
@@ -55,11 +60,11 @@ class Track(args.Verb):
             raise InputError("--rate and --at-most are above 0, --smooth is 0 or more")
         for path in self.out:
             require_writable(path, "--out")
-        from evercal.live.camera import StreamCamera
+        from evercal.live.camera import open_camera
         from evercal.localization.tracking import Tracker, TrackOptions
         from evercal.reports.track_files import TrackFile, track_row
 
-        source = StreamCamera(self.source, self.rate, timeout_s=None)
+        source = open_camera(self.source, self.rate, timeout_s=None)
         options = TrackOptions(
             fallback_s=1 / self.rate, at_most_ms=self.at_most, smooth=self.smooth
         )
@@ -69,12 +74,13 @@ class Track(args.Verb):
         with source as frames, ExitStack() as stack:
             localizer = args.open_map(self.store, self.scene)
             files = [stack.enter_context(TrackFile(path)) for path in self.out]
+            publisher = self._publisher()
             try:
                 for name, stamp, image, _ in frames:
                     if tracker is None:
-                        camera = args.stated_camera(
-                            self.camera, (image.shape[1], image.shape[0])
-                        )
+                        size = (image.shape[1], image.shape[0])
+                        camera = args.stated_camera(self.camera, size)
+                        camera = camera or source.intrinsics()
                         tracker = Tracker(localizer, camera, options)
                     frame = tracker.track(image, stamp)
                     states[frame.state] += 1
@@ -82,6 +88,9 @@ class Track(args.Verb):
                     known = unit_known(localizer, frame.estimate.scene)
                     for file in files:
                         file.write(frame, track_row(frame, name, known))
+                    pose = frame.estimate.uncertain_pose
+                    if publisher and pose and frame.state != "lost":
+                        publisher.publish(pose, stamp)
                     if not self.json:
                         say(_line(name, frame, known))
                     if self.most is not None and len(times) >= self.most:
@@ -92,6 +101,11 @@ class Track(args.Verb):
             raise InputError(f"{self.source}: no frame could be read")
         self._summary(states, times)
         return 0 if states["tracking"] + states["relocalized"] else 1
+
+    def _publisher(self) -> "PosePublisher | None":
+        from evercal.live.ros2.publishing import PosePublisher
+
+        return self.publish and PosePublisher(*self.publish, static=False)
 
     def _summary(self, states: Counter[str], times: list[float]) -> None:
         import numpy as np

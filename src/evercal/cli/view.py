@@ -1,9 +1,6 @@
 """`evercal view`."""
 
-import contextlib
-import signal
 import socket
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -28,14 +25,6 @@ class PageVerb(args.Verb):
             import viser  # noqa: F401
         except ImportError as error:
             raise missing_extra(f"the page needs {error.name}", "view") from None
-
-    def wait(self, url: str, words: str) -> None:
-        """Print words and the address, or it as JSON, and wait for SIGTERM or Ctrl-C."""
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-        with contextlib.suppress(KeyboardInterrupt):
-            self.answer({"url": url}, f"{words}; Ctrl-C ends it:", f"  {url}")
-            while True:
-                time.sleep(1.0)  # Ctrl-C does not end a wait without end on Windows
 
 
 @frozen
@@ -75,7 +64,8 @@ class View(PageVerb):
             url = page.server.url
             port = page.server.get_port()
             tunnel = f"ssh -L {port}:127.0.0.1:{port} {socket.gethostname()}"
-            self.wait(url, f"view of {self.store} (from another machine: {tunnel})")
+            words = f"view of {self.store} (from another machine: {tunnel})"
+            self.wait({"url": url}, words, f"  {url}")
         finally:
             page.close()
         return 0

@@ -1,6 +1,6 @@
 """Images of a camera while it runs.
 
-A live camera is any object with `read()`. `StreamCamera` reads every source of `evercal track`.
+A live camera is any object with `read()`. `open_camera` opens every source of `evercal track`.
 """
 
 import threading
@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Protocol, Self
 
 from evercal.errors import InputError
+from evercal.geometry import Camera
 from evercal.recordings.streams import StreamFrame, is_live, stream
 from evercal.typing import Image
 
@@ -19,6 +20,17 @@ class LiveCamera(Protocol):
     def read(self) -> tuple[float, Image]:
         """Return an image, (H, W, 3) RGB, and the time when it was taken, seconds."""
         ...
+
+
+def open_camera(
+    source: str, rate: float = 15.0, timeout_s: float | None = 5.0
+) -> "StreamCamera":
+    """The camera of a source, see `StreamCamera`, or of a topic such as `ros2:/image_raw`."""
+    if source.startswith("ros2:"):
+        from evercal.live.ros2.camera import Ros2Camera
+
+        return Ros2Camera(source, timeout_s)
+    return StreamCamera(source, rate, timeout_s)
 
 
 class StreamCamera:
@@ -33,6 +45,9 @@ class StreamCamera:
         timeout_s: Seconds without an image after which a live source has ended; None waits as long
             as it is open.
     """
+
+    frame_id = ""
+    """Name of the optical frame, where images state it."""
 
     def __init__(self, source: str, rate: float = 15.0, timeout_s: float | None = 5.0):
         self._source = source
@@ -63,6 +78,10 @@ class StreamCamera:
         """The images that `read` takes, with their names, until the source ends."""
         while (frame := self._next()) is not None:
             yield frame
+
+    def intrinsics(self) -> Camera | None:
+        """Those that the source states; None if it states none."""
+        return None
 
     def close(self) -> None:
         """Release the source, a live one after its next frame."""

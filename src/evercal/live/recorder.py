@@ -3,6 +3,7 @@
     ROOT/images/0000.jpg, ...     one image of each sample
     ROOT/base_from_gripper.csv    its gripper pose
     ROOT/camera.json              intrinsics of the camera
+    ROOT/frames.json              names of base, gripper and camera, where they are known
 
 The table is replaced as a whole after every change, so that the folder is a valid recording at any
 time. A folder that was begun earlier is continued.
@@ -19,6 +20,7 @@ from evercal.recordings.formats import wrist
 from evercal.recordings.frame import Frame, stated_grippers
 from evercal.recordings.images import write_jpeg
 from evercal.recordings.read_options import ReadOptions
+from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.storage import write_bytes, write_json
 from evercal.storage.text_files import is_link
 from evercal.typing import Image
@@ -36,9 +38,10 @@ _COLUMNS = "x,y,z,qw,qx,qy,qz"
 class WristRecorder:
     """Adds and removes samples of a recording; one of the same camera is continued."""
 
-    def __init__(self, root: Path, camera: Camera):
+    def __init__(self, root: Path, camera: Camera, names: FrameNames = UNKNOWN):
         self._root = Path(root)
         self._camera = camera
+        self._names = names
         self._frames: list[Frame] = []
         require_own(self._root / "images")
         if wrist.detect(self._root):
@@ -46,7 +49,9 @@ class WristRecorder:
                 raise InputError(
                     f"{root}: holds gripper poses, but no {POSES}; use a new folder"
                 )
-            self._frames = list(wrist.load(self._root, ReadOptions()).train)
+            begun = wrist.load(self._root, ReadOptions())
+            self._names = names.told(begun.frames, root)
+            self._frames = list(begun.train)
             if any(frame.camera != camera for frame in self._frames):
                 raise InputError(
                     f"{root}: was recorded with other intrinsics; use a new folder"
@@ -67,6 +72,8 @@ class WristRecorder:
         if not self._frames:
             (self._root / "images").mkdir(parents=True, exist_ok=True)
             write_json(self._root / "camera.json", asdict(self._camera))
+            if self._names != UNKNOWN:
+                write_json(self._root / wrist.NAMES, asdict(self._names))
         images = self._root / "images"
         path = images / next_name(images)
         write_jpeg(path, image, JPEG_QUALITY)

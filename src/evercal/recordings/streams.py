@@ -15,7 +15,7 @@ from evercal.recordings.images import as_rgb, read_image
 from evercal.recordings.poses.row_files import times_in_names
 from evercal.typing import Image
 
-_LIVE = re.compile(r"\d+|/dev/\S+|(rtsp|rtsps|http|https|udp|tcp)://\S+")
+_LIVE = re.compile(r"\d+|/dev/\S+|(rtsp|rtsps|http|https|udp|tcp)://\S+|ros2:\S+")
 """Sources whose frames have the time of their arrival."""
 _MOST_UNREADABLE = 30
 """A live source has ended after this many unreadable frames in a row."""

@@ -212,13 +212,9 @@ def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
 
 
 def _bag_camera(bag: BagFile, image_topic: str, size: tuple[int, int]) -> Camera:
-    """The first camera_info beside an image topic, such as `/cam/image_raw/compressed`.
-
-    Rectified images take P without distortion, others K and D.
-    """
+    """The first camera_info beside an image topic."""
     topics = bag.topics(CAMERA_INFO)
-    image = image_topic.removesuffix("/compressed")
-    beside = f"{image.rpartition('/')[0]}/camera_info"
+    beside = info_topic(image_topic)
     if beside not in topics:
         raise InputError(
             f"{bag.path}: no camera_info for {image_topic} ({beside} is expected, there is"
@@ -226,13 +222,24 @@ def _bag_camera(bag: BagFile, image_topic: str, size: tuple[int, int]) -> Camera
         )
     message = bag.first(beside)
     with named_errors(f"{bag.path}: {beside}", "camera_info"):
-        is_rectified = image.rpartition("/")[2].startswith("image_rect")
-        camera = _camera(message, size, is_rectified)
+        camera = camera_info_of(message, size, image_topic)
     check_size(f"{bag.path}: {beside}", camera, size, image_topic)
     return camera
 
 
-def _camera(message: Any, image_size: tuple[int, int], rectified: bool) -> Camera:
+def info_topic(image_topic: str) -> str:
+    """The topic of camera_info beside images, such as `/cam/image_raw/compressed`."""
+    image = image_topic.removesuffix("/compressed")
+    return f"{image.rpartition('/')[0]}/camera_info"
+
+
+def camera_info_of(message: Any, image_size: tuple[int, int], topic: str) -> Camera:
+    """Decode a sensor_msgs/CameraInfo for images of (width, height) on a topic.
+
+    Rectified images take P without distortion, others K and D.
+    """
+    image = topic.removesuffix("/compressed").rpartition("/")[2]
+    rectified = image.startswith("image_rect")
     k = _numbers(message, "k")
     if not any(k):
         raise ValueError("K is all zeros: the camera is not calibrated; give `camera`")

@@ -68,6 +68,8 @@ LAYOUTS = (
 """Recordings of other programs."""
 _POSES = tuple(f"base_from_gripper{ending}" for ending in POSE_ENDINGS)
 """Files of gripper poses."""
+NAMES = "frames.json"
+"""File of the names of base, gripper and camera."""
 _CAMERA_POSES = tuple(f"base_from_camera{ending}" for ending in POSE_ENDINGS)
 """Files of camera poses."""
 _ONE_POSE = "base_from_camera.txt"
@@ -164,6 +166,9 @@ def _frames(root: Path, layout: RecordingLayout, options: ReadOptions) -> Record
     name = root.resolve().name
     notes = (*notes, *more)
     named = rows.frames
+    if (root / NAMES).is_file():
+        with named_errors(root / NAMES, "names of frames"):
+            named = FrameNames.from_dict(read_json(root / NAMES, "names of frames"))
     if not is_gripper:
         named = FrameNames(named.base, "", named.gripper)
     return Recording(

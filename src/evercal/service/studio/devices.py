@@ -6,17 +6,13 @@ from typing import Literal
 
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, pose_distance_mm_deg
+from evercal.geometry import SE3, Camera
 from evercal.live.camera import LiveCamera
 from evercal.live.robot import Robot
+from evercal.live.sampling import sample
 from evercal.typing import Array, Image
 
 Which = Literal["wrist", "fixed"]
-
-STILL_MM = 0.2
-"""Change of the gripper's position, in millimetres, below which the arm stands still."""
-STILL_DEG = 0.05
-"""Change of the gripper's rotation, in degrees, below which the arm stands still."""
 
 
 @frozen_arrays
@@ -93,6 +89,17 @@ class Connection:
 
     def image(self, which: Which) -> Image:
         """Read an image."""
+        return self._read(which)[1]
+
+    def sample(self, which: Which = "wrist") -> tuple[Image, SE3]:
+        """Read an image, of a fixed camera one of a held thing, and the pose of the gripper."""
+        self.devices.hold(which == "fixed")
+        image, pose = sample(lambda: self._read(which), self.devices.robot)
+        self.base_from_gripper = pose
+        self.problems.pop("robot", None)
+        return image, pose
+
+    def _read(self, which: Which) -> tuple[float, Image]:
         camera = self.devices.cameras.get(which)
         if camera is None:
             option = {"wrist": "`camera`", "fixed": "`fixed`"}[which]
@@ -100,29 +107,12 @@ class Connection:
                 f"no {which} camera was given; restart with {option} SOURCE"
             )
         with self._lock:
-            self.images[which] = camera.read()[1]
+            stamp_s, self.images[which] = camera.read()
         self.problems.pop(which, None)
-        return self.images[which]
-
-    def sample(self, which: Which = "wrist") -> tuple[Image, SE3]:
-        """Read an image, of a fixed camera one of a held thing, and the pose of the gripper."""
-        self.devices.hold(which == "fixed")
-        before = self._pose()
-        image = self.image(which)
-        after = self._pose()
-        if _moved(before, after):
-            raise InputError(
-                "the arm moved while the image was taken; let it stand still"
-            )
-        return image, after
+        return stamp_s, self.images[which]
 
     def _pose(self) -> SE3:
         pose = self.devices.robot.base_from_gripper()
         self.base_from_gripper = pose
         self.problems.pop("robot", None)
         return pose
-
-
-def _moved(before: SE3, after: SE3) -> bool:
-    millimetres, degrees = pose_distance_mm_deg(before, after)
-    return bool(millimetres > STILL_MM or degrees > STILL_DEG)

@@ -14,7 +14,7 @@ import viser
 from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.errors import InputError
 from evercal.geometry import SE3, norms
-from evercal.live.camera import StreamCamera
+from evercal.live.camera import StreamCamera, open_camera
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker
 from evercal.recordings.cameras.camera_file import read_camera
@@ -86,10 +86,13 @@ class Page:
 
     def track(self, source: str, intrinsics: Path | None = None) -> None:
         """Show a camera, a video or a folder as it is tracked; by default with the map's camera."""
-        camera = StreamCamera(source)
+        camera = open_camera(source)
         height, width = camera.read()[1].shape[:2]
         size = (width, height)
-        stated = None if intrinsics is None else read_camera(intrinsics, size)
+        if intrinsics is None:
+            stated = camera.intrinsics()
+        else:
+            stated = read_camera(intrinsics, size)
         tracker = Tracker(self._localizer, stated)
         threading.Thread(
             target=self._track, args=(camera, tracker), daemon=True

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -145,28 +146,47 @@ class TfTree:
 
     def a_from_b(self, a: str, b: str, stamps_s: Array) -> tuple[SE3, BoolArray]:
         """Interpolate (n,) poses of frame b in frame a, and whether each is valid."""
-        chain_a = self._chain(a)
-        chain_b = self._chain(b)
-        for child in (*chain_a, *chain_b):
-            if child in self._edges:
-                self._refuse_ambiguous(child)
-        if chain_a[-1] != chain_b[-1]:
-            raise InputError(
-                f"{self._source}: tf has no chain between {a!r} and {b!r}: their roots are"
-                f" {chain_a[-1]!r} and {chain_b[-1]!r}; record the transform that joins them"
-            )
-        shared = {*chain_a}.intersection(chain_b)
         valid = np.ones(len(stamps_s), bool)
         sides = []
-        for chain in (chain_a, chain_b):
+        for links in self._links(a, b):
             ancestor_from_frame = SE3.identity((len(stamps_s),))
-            for child in chain:
-                if child not in shared:
-                    parent_from_child, is_valid = self._parent_from(child, stamps_s)
-                    ancestor_from_frame = parent_from_child @ ancestor_from_frame
-                    valid &= is_valid
+            for child in links:
+                parent_from_child, is_valid = self._parent_from(child, stamps_s)
+                ancestor_from_frame = parent_from_child @ ancestor_from_frame
+                valid &= is_valid
             sides.append(ancestor_from_frame)
         return sides[0].inverse() @ sides[1], valid
+
+    def until(self, a: str, b: str) -> float:
+        """Time of the last pose of frame b in frame a; infinite if nothing moves between them."""
+        last = [np.inf]
+        for child in chain(*self._links(a, b)):
+            stamps = [one.stamp_s or 0.0 for one in self._edge(child).moving]
+            if stamps:
+                last.append(max(stamps))
+        return min(last)
+
+    def forget(self, before_s: float) -> None:
+        """Drop moving transforms from before a time, but the last of each frame."""
+        for topics in self._edges.values():
+            for edge in topics.values():
+                kept = [one for one in edge.moving if (one.stamp_s or 0.0) >= before_s]
+                edge.moving = kept or edge.moving[-1:]
+                edge.static = edge.static[-1:]
+
+    def _links(self, a: str, b: str) -> list[list[str]]:
+        """The frames from a and from b up to the first that both are below, without it."""
+        chains = [self._chain(a), self._chain(b)]
+        for child in chain(*chains):
+            if child in self._edges:
+                self._refuse_ambiguous(child)
+        if chains[0][-1] != chains[1][-1]:
+            raise InputError(
+                f"{self._source}: tf has no chain between {a!r} and {b!r}: their roots are"
+                f" {chains[0][-1]!r} and {chains[1][-1]!r}; record the transform that joins them"
+            )
+        shared = {*chains[0]}.intersection(chains[1])
+        return [[child for child in side if child not in shared] for side in chains]
 
     def _add(self, transform: _Transform, topic: str) -> None:
         """Add a transform of a topic; /tf_static belongs to /tf."""
@@ -216,14 +236,14 @@ class TfTree:
         return poses[first], first == 0
 
     def _chain(self, frame: str) -> list[str]:
-        chain = [frame]
-        while chain[-1] in self._edges:
-            parent = self._edge(chain[-1]).parent
-            if parent in chain:
-                cycle = " -> ".join([*chain, parent])
+        frames = [frame]
+        while frames[-1] in self._edges:
+            parent = self._edge(frames[-1]).parent
+            if parent in frames:
+                cycle = " -> ".join([*frames, parent])
                 raise InputError(f"{self._source}: tf has a cycle: {cycle}")
-            chain.append(parent)
-        return chain
+            frames.append(parent)
+        return frames
 
 
 def _agree(edges: Sequence[_Edge]) -> bool:
