@@ -101,13 +101,13 @@ class Export(args.Verb):
         from evercal.calibration.export.request import require_names
         from evercal.live.ros2.publishing import PosePublisher
 
-        require_names(export.calibration, both=False)
+        calibration = export.calibration
+        require_names(calibration, both=False)
         publisher = PosePublisher(export.parent, export.child, static=True)
-        publisher.publish(export.calibration.uncertain_pose, time.time())
-        topics = publisher.topics
-        meaning = export.calibration.meaning
-        line = f"published {meaning}, on {' and '.join(topics)}"
-        self.wait({"topics": topics, "meaning": meaning}, line)
+        publisher.publish(calibration.uncertain_pose, time.time())
+        where = " and ".join(publisher.topics)
+        line = f"published on {where}: {calibration.meaning}"
+        self.wait({"topics": publisher.topics}, line)
 
     def _show(self, exported: "Exported", verdict: str) -> None:
         calibration = exported.calibration

@@ -1,7 +1,7 @@
 """`evercal record`."""
 
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Annotated
 
 from tyro.conf import Positional, arg
@@ -14,7 +14,7 @@ from evercal.errors import InputError
 
 @frozen
 class Record(args.Verb):
-    """Record a camera on the gripper while the arm visits poses, for `evercal learn`.
+    """Record a camera on the gripper while the arm visits poses.
 
     A sample is taken wherever the arm stands still at a new pose, until Ctrl-C; OUT is continued.
     Intrinsics and names of frames come from ROS 2 where the source is a topic of it.
@@ -43,11 +43,10 @@ class Record(args.Verb):
     """Stop when OUT holds so many samples."""
 
     def run(self) -> int:
-        from evercal.live.camera import open_camera
         from evercal.live.coverage import Sample, coverage
         from evercal.live.recorder import WristRecorder
-        from evercal.live.robot import open_robot
         from evercal.live.sampling import MovedError, sample, wait_at_new_pose
+        from evercal.live.sources import open_camera, open_robot
         from evercal.robot.frame_names import FrameNames
 
         poses = self.poses
@@ -60,8 +59,8 @@ class Record(args.Verb):
         names = FrameNames(self.base_frame or "", self.gripper_frame or "")
         robot = open_robot(poses, names, self.pose_convention)
         with open_camera(self.source) as camera:
-            height, width = camera.read()[1].shape[:2]
-            size = (width, height)
+            _, image = camera.read()
+            size = (image.shape[1], image.shape[0])
             stated = args.stated_camera(self.intrinsics, size)
             intrinsics = stated or camera.intrinsics()
             if intrinsics is None:
@@ -90,13 +89,7 @@ class Record(args.Verb):
             except KeyboardInterrupt:
                 pass
         covered = coverage(samples)
-        record = {
-            "recording": str(self.out),
-            "samples": len(samples),
-            "ready": covered.ready,
-            "verdict": covered.verdict,
-            "frames": asdict(names),
-        }
+        record = {"recording": str(self.out), "verdict": covered.verdict}
         line = f"wrote {self.out}: {covered.verdict}"
         self.answer(record, line, then=("learn", "MAP", self.out))
         return 0 if covered.ready else 1

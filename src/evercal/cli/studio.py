@@ -11,6 +11,8 @@ from evercal.cli.view import PageVerb
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
+    from evercal.geometry import Camera
+    from evercal.live.camera import StreamCamera
     from evercal.service.studio.devices import Devices
 
 _REAL = (
@@ -139,10 +141,8 @@ class Studio(PageVerb):
 
     def _real(self) -> "Devices":
         """The cameras and the pose file that were named."""
-        from evercal.live.camera import open_camera
-        from evercal.live.robot import open_robot
+        from evercal.live.sources import open_camera, open_robot
         from evercal.recordings import read_robot_poses
-        from evercal.recordings.cameras.camera_file import read_camera
         from evercal.recordings.streams import is_live
         from evercal.robot.frame_names import FrameNames
         from evercal.service.studio.devices import Devices
@@ -158,18 +158,11 @@ class Studio(PageVerb):
             intrinsics = fixed_intrinsics
         elif intrinsics is None and begun.is_file():
             intrinsics = begun
-        first = wrist or fixed
-        if intrinsics is not None:
-            camera = read_camera(intrinsics)
-        else:
-            camera = first and first.intrinsics()
+        camera = _intrinsics(intrinsics, wrist or fixed)
         if camera is None:
             raise InputError(
                 "no --intrinsics FILE given: a new recording needs the intrinsics"
             )
-        named_camera = fixed_intrinsics and read_camera(fixed_intrinsics)
-        if named_camera is None and fixed is not None:
-            named_camera = fixed.intrinsics()
         names = FrameNames(self.base_frame or "", self.gripper_frame or "")
         reachable = None
         if self.reachable is not None:
@@ -182,8 +175,16 @@ class Studio(PageVerb):
             intrinsics=camera,
             robot=open_robot(self.poses, names, convention, self.most_age),
             fixed_camera=fixed,
-            fixed_intrinsics=named_camera,
+            fixed_intrinsics=_intrinsics(fixed_intrinsics, fixed),
             reachable=reachable,
             rough=args.transform_of(self.gripper_from_camera),
             live=all(map(is_live, filter(None, (self.camera, self.fixed)))),
         )
+
+
+def _intrinsics(file: Path | None, camera: "StreamCamera | None") -> "Camera | None":
+    from evercal.recordings.cameras.camera_file import read_camera
+
+    if file is None:
+        return camera and camera.intrinsics()
+    return read_camera(file)

@@ -14,7 +14,6 @@ from evercal.errors import InputError
 from evercal.reports.answers import unit_known
 
 if TYPE_CHECKING:
-    from evercal.live.ros2.publishing import PosePublisher
     from evercal.localization.tracking import TrackedFrame
 
 FEW_FRAMES = 10
@@ -60,7 +59,7 @@ class Track(args.Verb):
             raise InputError("--rate and --at-most are above 0, --smooth is 0 or more")
         for path in self.out:
             require_writable(path, "--out")
-        from evercal.live.camera import open_camera
+        from evercal.live.sources import open_camera
         from evercal.localization.tracking import Tracker, TrackOptions
         from evercal.reports.track_files import TrackFile, track_row
 
@@ -69,12 +68,16 @@ class Track(args.Verb):
             fallback_s=1 / self.rate, at_most_ms=self.at_most, smooth=self.smooth
         )
         tracker: Tracker | None = None
+        publisher = None
+        if self.publish is not None:
+            from evercal.live.ros2.publishing import PosePublisher
+
+            publisher = PosePublisher(*self.publish, static=False)
         states: Counter[str] = Counter()
         times: list[float] = []
         with source as frames, ExitStack() as stack:
             localizer = args.open_map(self.store, self.scene)
             files = [stack.enter_context(TrackFile(path)) for path in self.out]
-            publisher = self._publisher()
             try:
                 for name, stamp, image, _ in frames:
                     if tracker is None:
@@ -101,11 +104,6 @@ class Track(args.Verb):
             raise InputError(f"{self.source}: no frame could be read")
         self._summary(states, times)
         return 0 if states["tracking"] + states["relocalized"] else 1
-
-    def _publisher(self) -> "PosePublisher | None":
-        from evercal.live.ros2.publishing import PosePublisher
-
-        return self.publish and PosePublisher(*self.publish, static=False)
 
     def _summary(self, states: Counter[str], times: list[float]) -> None:
         import numpy as np

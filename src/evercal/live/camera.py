@@ -1,6 +1,6 @@
 """Images of a camera while it runs.
 
-A live camera is any object with `read()`. `open_camera` opens every source of `evercal track`.
+A live camera is any object with `read()`. `StreamCamera` reads every source of `evercal track`.
 """
 
 import threading
@@ -20,17 +20,6 @@ class LiveCamera(Protocol):
     def read(self) -> tuple[float, Image]:
         """Return an image, (H, W, 3) RGB, and the time when it was taken, seconds."""
         ...
-
-
-def open_camera(
-    source: str, rate: float = 15.0, timeout_s: float | None = 5.0
-) -> "StreamCamera":
-    """The camera of a source, see `StreamCamera`, or of a topic such as `ros2:/image_raw`."""
-    if source.startswith("ros2:"):
-        from evercal.live.ros2.camera import Ros2Camera
-
-        return Ros2Camera(source, timeout_s)
-    return StreamCamera(source, rate, timeout_s)
 
 
 class StreamCamera:
@@ -81,7 +70,6 @@ class StreamCamera:
 
     def intrinsics(self) -> Camera | None:
         """Those that the source states; None if it states none."""
-        return None
 
     def close(self) -> None:
         """Release the source, a live one after its next frame."""

@@ -11,7 +11,6 @@ from typing import Protocol, runtime_checkable
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.robot_poses import read_last_robot_pose
-from evercal.robot.frame_names import UNKNOWN, FrameNames
 
 
 @runtime_checkable
@@ -39,20 +38,6 @@ class TimedRobot(Robot, Protocol):
     def at(self, stamp_s: float) -> SE3:
         """Pose of the gripper when an image was taken, by the clock of the images."""
         ...
-
-
-def open_robot(
-    source: str | Path,
-    frames: FrameNames = UNKNOWN,
-    convention: str | None = None,
-    most_age_s: float | None = None,
-) -> Robot:
-    """The robot of a pose file, see `PoseFileRobot`, or for `ros2:` that of tf."""
-    if str(source) == "ros2:":
-        from evercal.live.ros2.robot import Ros2Robot
-
-        return Ros2Robot(frames)
-    return PoseFileRobot(source, convention, most_age_s)
 
 
 class PoseFileRobot:

@@ -1,6 +1,6 @@
 """Publishers of a ROS 2 graph, written with Cyclone's own classes and without evercal.
 
-    drivers.py camera KIND RELIABILITY WxH    images, raw or compressed, 15 a second, and camera_info
+    drivers.py camera KIND RELIABILITY WxH    images and camera_info, 15 a second
     drivers.py arm                            a shoulder that turns, a tool on it, static frames
 
 Each line on stdin is a number: an arm stands at that angle, a camera shows that grey.
@@ -193,5 +193,6 @@ if __name__ == "__main__":
 
     threading.Thread(target=listen, daemon=True).start()
     what, *words = sys.argv[1:]
-    print("ready", flush=True)
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
     {"camera": camera, "arm": arm}[what](*words)

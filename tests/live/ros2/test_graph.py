@@ -9,8 +9,8 @@ pytest.importorskip("cyclonedds")
 pytest.importorskip("rosbags")
 
 from evercal.errors import InputError
-from evercal.live.camera import open_camera
-from evercal.live.robot import TimedRobot, open_robot
+from evercal.live.robot import TimedRobot
+from evercal.live.sources import open_camera, open_robot
 from evercal.robot.frame_names import FrameNames
 
 from .graphs import driver, environment
@@ -56,11 +56,12 @@ def test_images_of_three_megabytes_arrive_whole():
             stamp, image = camera.read()
             times.append(stamp)
             assert image.shape == (720, 1280, 3)
-            assert (image[:, :640] == (200, 100, 50)).all() and not image[:, 640:].any()
+            assert (image[:, :640] == (200, 100, 50)).all()
+            assert not image[:, 640:].any()
         assert times == sorted(set(times))
 
 
-def test_the_gripper_is_where_tf_has_it_now_and_at_a_time():
+def test_the_gripper_is_where_tf_has_it_now_and_at_a_time(monkeypatch):
     with driver("arm") as process:
         time.sleep(0.3)  # tf_static is from before
         robot = open_robot("ros2:")
@@ -76,7 +77,7 @@ def test_the_gripper_is_where_tf_has_it_now_and_at_a_time():
         assert isinstance(robot, TimedRobot)
         before = robot.at(time.time())
         np.testing.assert_allclose(before.translation_m, moved.translation_m)
-        robot.frames = FrameNames()
+        monkeypatch.setattr("evercal.live.ros2.robot.FIND_S", 0.2)
         with pytest.raises(InputError, match="clocks"):
             robot.at(time.time() - 100)
 
@@ -86,7 +87,7 @@ def test_frames_that_are_not_there(monkeypatch):
     with driver("arm"):
         robot = open_robot("ros2:", FrameNames("world", "tool0"))
         with pytest.raises(
-            InputError, match="`base_frame` world.* base_link, shoulder"
+            InputError, match=r"`base_frame` world.* base_link, shoulder"
         ):
             robot.base_from_gripper()
 
@@ -101,7 +102,9 @@ def test_a_camera_or_an_arm_that_is_gone(monkeypatch):
             camera.read()
         robot = open_robot("ros2:")
         robot.base_from_gripper()
-    with pytest.raises(InputError, match="no new pose of tool0 in base_link"):
+    with pytest.raises(
+        InputError, match="no pose of tool0 in base_link at the time asked for"
+    ):
         robot.base_from_gripper()
 
 
@@ -109,15 +112,17 @@ def test_another_domain_and_another_type(monkeypatch):
     monkeypatch.setattr("evercal.live.ros2.graph.FIND_S", 0.5)
     with driver("camera", "raw", "best_effort", "64x48"):
         assert open_camera(RAW).read()[1].shape == (48, 64, 3)
-        with pytest.raises(InputError, match="topics of this type: /camera/image_raw"):
+        with pytest.raises(InputError, match="it is on /camera/image_raw"):
             open_camera("ros2:/camera/camera_info")
         in_new_domain(monkeypatch)
-        with pytest.raises(InputError, match=r"nobody publishes sensor_msgs/Image"):
+        with pytest.raises(InputError, match=r"nobody publishes sensor_msgs/msg/Image"):
             open_camera(RAW)
 
 
-@pytest.mark.parametrize("domain", ["-1", "300", "home"])
+@pytest.mark.parametrize("domain", ["300", "home"])
 def test_a_domain_that_is_none(monkeypatch, domain):
     monkeypatch.setenv("ROS_DOMAIN_ID", domain)
-    with pytest.raises(InputError, match=f"ROS_DOMAIN_ID {domain}: a domain is 0 to"):
+    with pytest.raises(
+        InputError, match=f"ROS_DOMAIN_ID {domain}: .* a domain is 0 to"
+    ):
         open_camera(RAW)

@@ -1,1 +1,6 @@
 """Cameras, robots and publishers of a running ROS 2 graph, without ROS (extra `ros2`)."""
+
+from evercal.errors import optional_module
+
+for _module in ("cyclonedds.idl", "rosbags.typesys"):
+    optional_module(_module, "ros2: needs cyclonedds and rosbags", "ros2")

@@ -5,8 +5,7 @@ import time
 from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.live.camera import StreamCamera
-from evercal.live.ros2.graph import PREFIX, Graph
-from evercal.recordings.cameras.camera_file import check_size
+from evercal.live.ros2.graph import Graph
 from evercal.recordings.formats.bags.file import CAMERA_INFO, COMPRESSED, IMAGE
 from evercal.recordings.formats.bags.tf_tree import plain_name
 from evercal.recordings.formats.ros_bag import (
@@ -34,25 +33,19 @@ class Ros2Camera(StreamCamera):
         self._source = source
         self._timeout_s = timeout_s
         self._graph = Graph()
-        topic = "/" + source.removeprefix(PREFIX).lstrip("/")
-        self._images = self._graph.subscribe(topic, (IMAGE, COMPRESSED))
-        self._number = 0
-        self._size: tuple[int, int] | None = None
+        topic = "/" + source.removeprefix("ros2:").lstrip("/")
+        self._images = self._graph.find(topic, (IMAGE, COMPRESSED))
 
     def intrinsics(self) -> Camera:
         """Those of the camera_info beside the images; InputError without any."""
-        if self._size is None:
-            self.read()
-        size = self._size or (0, 0)
-        topic = info_topic(self._images.topic)
-        infos = self._graph.subscribe(topic, (CAMERA_INFO,))
-        message = infos.next(self._timeout_s)
+        height, width = self.read()[1].shape[:2]
+        images = self._images.topic
+        topic = info_topic(images)
+        message = self._graph.find(topic, (CAMERA_INFO,)).next(self._timeout_s)
         if message is None:
-            raise InputError(f"{PREFIX}{topic}: nothing arrives; give the intrinsics")
-        with named_errors(PREFIX + topic, "camera_info"):
-            camera = camera_info_of(message.content, size, self._images.topic)
-        check_size(PREFIX + topic, camera, size, self._source)
-        return camera
+            raise InputError(f"ros2:{topic}: nothing arrives; give the intrinsics")
+        size = (width, height)
+        return camera_info_of(f"ros2:{topic}", message.content, size, images)
 
     def close(self) -> None:
         """Nothing to release: the participant leaves with its last reader."""
@@ -61,13 +54,10 @@ class Ros2Camera(StreamCamera):
         message = self._images.next(self._timeout_s)
         if message is None:
             return None
-        decode = image_of
-        if self._images.kind == COMPRESSED:
-            decode = compressed_image_of
+        content = message.content
+        decode = compressed_image_of if self._images.kind == COMPRESSED else image_of
         with named_errors(self._source, "image"):
-            image = decode(message.content)
-        self.frame_id = plain_name(message.content.header.frame_id)
-        self._size = (image.shape[1], image.shape[0])
-        self._number += 1
-        stamp_s = message.seconds(message.content.header, 0)
-        return StreamFrame(str(self._number - 1), stamp_s, image, time.monotonic())
+            image = decode(content)
+        self.frame_id = plain_name(content.header.frame_id)
+        stamp_s = message.seconds(content.header, 0)
+        return StreamFrame(f"{stamp_s:.3f}", stamp_s, image, time.monotonic())

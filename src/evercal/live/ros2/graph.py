@@ -1,25 +1,45 @@
 """`Graph`: a participant of a ROS 2 graph, by Cyclone DDS without ROS.
 
 A topic `/tf` of ROS is `rt/tf` of DDS, and its type `tf2_msgs/msg/TFMessage` is
-`tf2_msgs::msg::dds_::TFMessage_`. Cyclone passes messages as bytes; rosbags decodes them as those
-of bags, a large image 100 times as fast as Cyclone's own Python classes.
+`tf2_msgs::msg::dds_::TFMessage_`. Cyclone passes messages as bytes; rosbags reads and writes them
+as those of bags, which takes milliseconds for an image where Cyclone's own classes take a tenth of
+a second.
 """
 
 import os
 import time
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from evercal.errors import InputError, optional_module
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+from cyclonedds.core import (
+    DDSException,
+    InstanceState,
+    Policy,
+    Qos,
+    ReadCondition,
+    SampleState,
+    ViewState,
+)
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import make_idl_struct, types
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from rosbags.typesys import Stores, get_typestore
+
+from evercal.errors import InputError
 from evercal.recordings.formats.bags.file import Message
 
-PREFIX = "ros2:"
-"""Begin of the address of a topic, such as `ros2:/camera/image_raw`."""
 FIND_S = 5.0
 """Time that a publisher has to appear on the graph, seconds."""
-_NEED = f"{PREFIX} needs cyclonedds and rosbags"
-_DAYS_NS = 10**15
-"""Longer than anyone waits, nanoseconds."""
+_ALIVE = ViewState.Any | SampleState.Any | InstanceState.Alive
+_MANY = 10_000
+"""More than arrive at once."""
+_STORE = get_typestore(Stores.ROS2_HUMBLE)
+"""Types of messages; those used here never changed."""
+_PLAIN = {"string": str, "bool": bool}
 
 
 class Graph:
@@ -27,165 +47,116 @@ class Graph:
 
     def __init__(self) -> None:
         domain = os.environ.get("ROS_DOMAIN_ID") or "0"
-        if not domain.isdigit() or int(domain) > 232:
-            raise InputError(f"ROS_DOMAIN_ID {domain}: a domain is 0 to 232")
-        self.domain = int(domain)
         try:
-            participant = _dds("domain").DomainParticipant(self.domain)
-        except _dds("core").DDSException as error:
+            self._participant = DomainParticipant(int(domain))
+        except (ValueError, DDSException) as error:
             raise InputError(
-                f"no ROS 2 graph can be joined in domain {domain} ({error}); check the network and"
-                " CYCLONEDDS_URI"
+                f"ROS_DOMAIN_ID {domain}: no ROS 2 graph can be joined ({error}); a domain is 0 to"
+                " 232; check the network and CYCLONEDDS_URI"
             ) from None
-        self.participant: Any = participant
-        builtin = _dds("builtin")
-        publications = builtin.BuiltinTopicDcpsPublication
-        self._publishers = builtin.BuiltinDataReader(participant, publications)
+        self._writers = BuiltinDataReader(
+            self._participant, BuiltinTopicDcpsPublication
+        )
 
-    def topics(self) -> dict[str, tuple[str, bool]]:
-        """By topic that is published now: its type, and whether all writers are reliable."""
-        core = _dds("core")
-        alive = core.ViewState.Any | core.SampleState.Any | core.InstanceState.Alive
-        condition = core.ReadCondition(self._publishers, alive)
-        best_effort = core.Policy.Reliability.BestEffort
-        topics: dict[str, tuple[str, bool]] = {}
-        for writer in self._publishers.read(10_000, condition):
-            prefix, _, topic = writer.topic_name.partition("/")
-            package, _, name = writer.type_name.partition("::msg::dds_::")
-            if prefix == "rt" and name:
-                topic = f"/{topic}"
-                reliable = writer.qos[core.Policy.Reliability] != best_effort
-                _, others = topics.get(topic, ("", True))
-                kind = f"{package}/msg/{name.removesuffix('_')}"
-                topics[topic] = (kind, reliable and others)
-        return topics
-
-    def subscribe(
-        self, topic: str, kinds: tuple[str, ...], depth: int = 1
-    ) -> "Subscription":
+    def find(self, topic: str, kinds: tuple[str, ...]) -> "Subscription":
         """Read a topic of one of some types as its publishers offer it.
 
         Raises:
             InputError: Nobody publishes it within `FIND_S`.
         """
         end = time.monotonic() + FIND_S
-        while (found := self.topics().get(topic, ("", False)))[0] not in kinds:
+        alive = ReadCondition(self._writers, _ALIVE)
+        while True:
+            writers = self._writers.read(_MANY, alive)
+            writers = [one for one in writers if _kind(one) in kinds]
+            own = [one for one in writers if one.topic_name == f"rt{topic}"]
+            if own:
+                offers = [one.qos[Policy.Reliability] for one in own]
+                reliable = Policy.Reliability.BestEffort not in offers
+                return self.subscribe(topic, _kind(own[0]), reliable)
             if time.monotonic() > end:
-                raise InputError(self._absent(topic, kinds))
+                break
             time.sleep(0.02)
-        return Subscription(self, topic, *found, depth)
+        there = sorted({one.topic_name[2:] for one in writers}) or ["no topic"]
+        raise InputError(
+            f"ros2:{topic}: nobody publishes {' or '.join(kinds)}; it is on {', '.join(there)}."
+            " Check the driver and ROS_DOMAIN_ID"
+        )
 
-    def _absent(self, topic: str, kinds: tuple[str, ...]) -> str:
-        names = sorted(
-            name for name, (kind, _) in self.topics().items() if kind in kinds
-        )
-        what = " or ".join(kind.replace("/msg", "") for kind in kinds)
-        there = ", ".join(names) or "none"
-        return (
-            f"{PREFIX}{topic}: nobody publishes {what} there in domain {self.domain}; topics of"
-            f" this type: {there}. Check the driver and ROS_DOMAIN_ID"
-        )
+    def subscribe(
+        self, topic: str, kind: str, reliable: bool, depth: int = 1
+    ) -> "Subscription":
+        """Read a topic, whoever publishes it; the last `depth` messages wait to be taken."""
+        endpoint = Topic(self._participant, f"rt{topic}", _wire(kind))
+        qos = _qos(reliable, topic.endswith("tf_static"), depth)
+        return Subscription(topic, kind, DataReader(self._participant, endpoint, qos))
+
+    def publisher(self, topic: str, kind: str, latched: bool) -> Callable[[Any], None]:
+        """A function that sends a message; a latched one also reaches readers that come later."""
+        endpoint = Topic(self._participant, f"rt{topic}", _wire(kind))
+        writer = DataWriter(self._participant, endpoint, _qos(True, latched, 1))
+
+        def publish(message: Any) -> None:
+            data = _STORE.serialize_cdr(message, kind)
+            writer.write(_wire(kind)(bytes(data)))
+
+        return publish
 
 
 class Subscription:
-    """A reader of one topic that keeps the last messages, `latched` ones from before, too."""
+    """The messages of one topic."""
 
-    def __init__(self, graph: Graph, topic: str, kind: str, reliable: bool, depth: int):
-        core = _dds("core")
-        self._graph = graph
+    def __init__(self, topic: str, kind: str, reader: Any):
         self.topic = topic
         self.kind = kind
-        latched = topic.endswith("tf_static")
-        endpoint = _topic(graph, topic, kind)
-        qos = _qos(reliable or latched, latched, depth)
-        self._reader = _dds("sub").DataReader(graph.participant, endpoint, qos)
-        unread = core.ViewState.Any | core.SampleState.NotRead | core.InstanceState.Any
-        self._condition = core.ReadCondition(self._reader, unread)
-        self._unread = core.WaitSet(graph.participant)
-        self._unread.attach(self._condition)
+        self._reader = reader
 
     def take(self) -> list[Message]:
-        """Decode the messages that have arrived, oldest first."""
-        messages = []
-        for sample in self._samples():
-            messages.append(self._decoded(sample))
-        return messages
+        """Those that have arrived, oldest first."""
+        samples = self._reader.take(_MANY)
+        return [self._decoded(one) for one in samples if one.sample_info.valid_data]
 
     def next(self, timeout_s: float | None = None) -> Message | None:
-        """The first message that arrives from now on; None after a time without one."""
-        self._samples()
-        timeout_ns = _DAYS_NS if timeout_s is None else int(timeout_s * 1e9)
-        self._unread.wait(timeout_ns)
-        for message in self.take():
-            return message
+        """The first that arrives from now on; None after a time without one."""
+        self._reader.take(_MANY)
+        for sample in self._reader.take_iter(
+            timeout=timeout_s and int(timeout_s * 1e9)
+        ):
+            return self._decoded(sample)
         return None
-
-    def _samples(self) -> list[Any]:
-        samples = self._reader.take(10_000, self._condition)
-        return [sample for sample in samples if sample.sample_info.valid_data]
 
     def _decoded(self, sample: Any) -> Message:
         try:
-            content = _types().deserialize_cdr(memoryview(sample.data), self.kind)
+            content = _STORE.deserialize_cdr(memoryview(sample.data), self.kind)
         except Exception as error:  # whatever rosbags meets in the bytes
-            raise InputError(
-                f"{PREFIX}{self.topic}: a message that is no {self.kind}: {error}"
-            ) from None
+            raise InputError(f"ros2:{self.topic}: not a {self.kind}: {error}") from None
         return Message(self.topic, sample.sample_info.source_timestamp, 0, content)
 
 
-class Publisher:
-    """A reliable writer of one topic; a latched one also serves readers that come later."""
-
-    def __init__(self, graph: Graph, topic: str, kind: str, latched: bool = False):
-        self._kind = kind
-        self._graph = graph
-        endpoint = _topic(graph, topic, kind)
-        qos = _qos(True, latched, 1)
-        self._writer = _dds("pub").DataWriter(graph.participant, endpoint, qos)
-
-    def publish(self, message: Any) -> None:
-        """Send a message of rosbags' class."""
-        data = bytes(_types().serialize_cdr(message, self._kind))
-        self._writer.write(_wire(self._kind)(data))
+def _kind(writer: Any) -> str:
+    """Type of a writer as ROS writes it."""
+    return writer.type_name.replace("::msg::dds_::", "/msg/").removesuffix("_")
 
 
-def make(kind: str, **fields: Any) -> Any:
-    """A message of rosbags' class, such as of `std_msgs/msg/Header`."""
-    return _types().types[kind](**fields)
+def make(kind: str, *values: Any) -> Any:
+    """A message such as `std_msgs/msg/Header` of its fields in order."""
+    return _STORE.types[kind](*values)
 
 
-def _dds(module: str) -> Any:
-    return optional_module(f"cyclonedds.{module}", _NEED, "ros2")
-
-
-@cache
-def _types() -> Any:
-    typesys = optional_module("rosbags.typesys", _NEED, "ros2")
-    return typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-
-
-def _qos(reliable: bool, latched: bool, depth: int) -> Any:
-    policy = _dds("core").Policy
-    reliability = policy.Reliability.BestEffort
-    if reliable:
-        reliability = policy.Reliability.Reliable(10**8)
-    durability = policy.Durability.Volatile
-    if latched:
-        durability = policy.Durability.TransientLocal
-    # ROS 2 writes and reads the first version of CDR.
-    version = policy.DataRepresentation(use_cdrv0_representation=True)
-    history = policy.History.KeepLast(depth)
-    return _dds("core").Qos(reliability, durability, history, version)
-
-
-def _topic(graph: Graph, topic: str, kind: str) -> Any:
-    return _dds("topic").Topic(graph.participant, f"rt{topic}", _wire(kind))
+def _qos(reliable: bool, latched: bool, depth: int) -> Qos:
+    return Qos(
+        Policy.Reliability.Reliable(10**8)
+        if reliable
+        else Policy.Reliability.BestEffort,
+        Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
+        Policy.History.KeepLast(depth),
+        Policy.DataRepresentation(use_cdrv0_representation=True),  # as ROS 2
+    )
 
 
 @cache
 def _wire(kind: str) -> Any:
-    """The class of a type for Cyclone, whose messages stay bytes."""
+    """The class of a type for Cyclone, whose objects hold its bytes."""
 
     class Wire:
         __idl__ = _struct(kind).__idl__
@@ -193,10 +164,7 @@ def _wire(kind: str) -> Any:
         def __init__(self, data: bytes):
             self.data = data
 
-        @classmethod
-        def deserialize(cls, data: bytes) -> Any:
-            return cls(data)
-
+        deserialize = classmethod(lambda cls, data: cls(data))
         deserialize_key = deserialize
 
         def serialize(self, **_: Any) -> bytes:
@@ -209,20 +177,16 @@ def _wire(kind: str) -> Any:
 def _struct(kind: str) -> Any:
     """Cyclone's description of a type of rosbags, by which participants compare types."""
     package, _, name = kind.split("/")
-    fields = {}
-    for field, description in _types().fielddefs[kind][1]:
-        fields[field] = _field(*description)
-    typename = f"{package}.msg.dds_.{name}_"
-    return _dds("idl").make_idl_struct(f"{name}_", typename, fields)
+    fields = {field: _field(*what) for field, what in _STORE.fielddefs[kind][1]}
+    return make_idl_struct(f"{name}_", f"{package}.msg.dds_.{name}_", fields)
 
 
 def _field(node: Any, what: Any) -> Any:
-    idl = _dds("idl.types")
     if node.name == "NAME":
         return _struct(what)
     if node.name == "BASE":
-        return {"string": str, "bool": bool}.get(what[0]) or getattr(idl, what[0])
+        return _PLAIN.get(what[0]) or getattr(types, what[0])
     inner = _field(*what[0])
     if node.name == "ARRAY":
-        return idl.array[inner, what[1]]
-    return idl.sequence[inner]
+        return types.array[inner, what[1]]
+    return types.sequence[inner]

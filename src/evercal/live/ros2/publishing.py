@@ -1,13 +1,11 @@
 """Poses for other programs of the graph: on tf, and with their covariance."""
 
 import re
-from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from evercal.geometry import UncertainPose
-from evercal.live.ros2.graph import Graph, Publisher, make
+from evercal.live.ros2.graph import Graph, make
 from evercal.recordings.formats.bags.file import TF
 from evercal.typing import Array
 
@@ -22,45 +20,34 @@ class PosePublisher:
     """
 
     def __init__(self, parent: str, child: str, static: bool):
-        graph = Graph()
         self._parent = parent
         self._child = child
         name = re.sub(r"\W", "_", child)
         tf = "/tf_static" if static else "/tf"
         self.topics = (tf, f"/evercal/{name}/pose")
         """Of the transform, and of the pose with its covariance."""
-        self._tf = Publisher(graph, self.topics[0], TF[0], latched=static)
-        self._pose = Publisher(graph, self.topics[1], POSE, latched=static)
+        graph = Graph()
+        self._tf = graph.publisher(tf, TF[0], static)
+        self._pose = graph.publisher(self.topics[1], POSE, static)
 
     def publish(self, pose: UncertainPose, stamp_s: float) -> None:
         """Send a pose that holds at a time, seconds."""
-        seconds, nanoseconds = divmod(round(stamp_s * 1e9), 10**9)
-        stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-        header = make("std_msgs/msg/Header", stamp=stamp, frame_id=self._parent)
-        w, *axes = pose.pose.rotation_wxyz.tolist()
-        rotation = _numbers("Quaternion", [*axes, w])
+        time = divmod(round(stamp_s * 1e9), 10**9)
+        stamp = make("builtin_interfaces/msg/Time", *time)
+        header = make("std_msgs/msg/Header", stamp, self._parent)
+        w, x, y, z = pose.pose.rotation_wxyz.tolist()
         place = pose.pose.translation_m.tolist()
-        transform = make(
-            "geometry_msgs/msg/TransformStamped",
-            header=header,
-            child_frame_id=self._child,
-            transform=make(
-                "geometry_msgs/msg/Transform",
-                translation=_numbers("Vector3", place),
-                rotation=rotation,
-            ),
-        )
-        self._tf.publish(make(TF[0], transforms=[transform]))
-        stated = make(
-            "geometry_msgs/msg/PoseWithCovariance",
-            pose=make(
-                "geometry_msgs/msg/Pose",
-                position=_numbers("Point", place),
-                orientation=rotation,
-            ),
-            covariance=about_fixed_axes(pose).ravel(),
-        )
-        self._pose.publish(make(POSE, header=header, pose=stated))
+        rotation = make("geometry_msgs/msg/Quaternion", x, y, z, w)
+        vector = make("geometry_msgs/msg/Vector3", *place)
+        moved = make("geometry_msgs/msg/Transform", vector, rotation)
+        child = self._child
+        moved = make("geometry_msgs/msg/TransformStamped", header, child, moved)
+        self._tf(make(TF[0], [moved]))
+        point = make("geometry_msgs/msg/Point", *place)
+        plain = make("geometry_msgs/msg/Pose", point, rotation)
+        covariance = about_fixed_axes(pose).ravel()
+        stated = make("geometry_msgs/msg/PoseWithCovariance", plain, covariance)
+        self._pose(make(POSE, header, stated))
 
 
 def about_fixed_axes(pose: UncertainPose) -> Array:
@@ -68,7 +55,3 @@ def about_fixed_axes(pose: UncertainPose) -> Array:
     slope = np.eye(6)
     slope[3:, 3:] = pose.pose.rotation_matrix()
     return slope @ pose.covariance @ slope.T
-
-
-def _numbers(kind: str, values: Sequence[float]) -> Any:
-    return make(f"geometry_msgs/msg/{kind}", **dict(zip("xyzw", values, strict=False)))

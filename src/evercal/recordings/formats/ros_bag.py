@@ -220,11 +220,7 @@ def _bag_camera(bag: BagFile, image_topic: str, size: tuple[int, int]) -> Camera
             f"{bag.path}: no camera_info for {image_topic} ({beside} is expected, there is"
             f" {' and '.join(topics) or 'none'}); record it, or give the intrinsics with `camera`"
         )
-    message = bag.first(beside)
-    with named_errors(f"{bag.path}: {beside}", "camera_info"):
-        camera = camera_info_of(message, size, image_topic)
-    check_size(f"{bag.path}: {beside}", camera, size, image_topic)
-    return camera
+    return camera_info_of(f"{bag.path}: {beside}", bag.first(beside), size, image_topic)
 
 
 def info_topic(image_topic: str) -> str:
@@ -233,13 +229,21 @@ def info_topic(image_topic: str) -> str:
     return f"{image.rpartition('/')[0]}/camera_info"
 
 
-def camera_info_of(message: Any, image_size: tuple[int, int], topic: str) -> Camera:
-    """Decode a sensor_msgs/CameraInfo for images of (width, height) on a topic.
+def camera_info_of(
+    source: str, message: Any, image_size: tuple[int, int], topic: str
+) -> Camera:
+    """Decode a sensor_msgs/CameraInfo from `source`, for images of (width, height) on a topic.
 
     Rectified images take P without distortion, others K and D.
     """
     image = topic.removesuffix("/compressed").rpartition("/")[2]
-    rectified = image.startswith("image_rect")
+    with named_errors(source, "camera_info"):
+        camera = _camera(message, image_size, image.startswith("image_rect"))
+    check_size(source, camera, image_size, topic)
+    return camera
+
+
+def _camera(message: Any, image_size: tuple[int, int], rectified: bool) -> Camera:
     k = _numbers(message, "k")
     if not any(k):
         raise ValueError("K is all zeros: the camera is not calibrated; give `camera`")

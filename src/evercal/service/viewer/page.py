@@ -14,7 +14,8 @@ import viser
 from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.errors import InputError
 from evercal.geometry import SE3, norms
-from evercal.live.camera import StreamCamera, open_camera
+from evercal.live.camera import StreamCamera
+from evercal.live.sources import open_camera
 from evercal.localization.localizer import Localizer
 from evercal.localization.tracking import Tracker
 from evercal.recordings.cameras.camera_file import read_camera

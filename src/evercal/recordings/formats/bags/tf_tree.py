@@ -1,5 +1,6 @@
 """The tree of the transforms of tf: its frames, and the pose of one in another over time."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import chain
@@ -86,9 +87,15 @@ class _Edge:
 
 
 class TfTree:
-    """Transforms, added in any order; `topic` is used if several topics move one frame."""
+    """Transforms, added in any order; `topic` is used if several topics move one frame.
 
-    def __init__(self, source: str, topic: str | None = None) -> None:
+    The last `most` transforms of each frame are kept.
+    """
+
+    def __init__(
+        self, source: str, topic: str | None = None, most: int = sys.maxsize
+    ) -> None:
+        self._most = most
         self._source = source
         self._topic = topic
         self._edges: dict[str, dict[str, _Edge]] = {}  # by child and topic
@@ -122,7 +129,7 @@ class TfTree:
     def frame(self, wanted: str | None, usual: Sequence[str], option: str) -> str:
         """The frame that is wanted, or the only one with a usual name; else an InputError."""
         frames = self.frames()
-        if wanted is not None:
+        if wanted:
             name = plain_name(wanted)
             if name not in frames:
                 raise InputError(
@@ -161,18 +168,9 @@ class TfTree:
         """Time of the last pose of frame b in frame a; infinite if nothing moves between them."""
         last = [np.inf]
         for child in chain(*self._links(a, b)):
-            stamps = [one.stamp_s or 0.0 for one in self._edge(child).moving]
-            if stamps:
-                last.append(max(stamps))
+            for transform in self._edge(child).moving[-1:]:
+                last.append(transform.stamp_s or 0.0)
         return min(last)
-
-    def forget(self, before_s: float) -> None:
-        """Drop moving transforms from before a time, but the last of each frame."""
-        for topics in self._edges.values():
-            for edge in topics.values():
-                kept = [one for one in edge.moving if (one.stamp_s or 0.0) >= before_s]
-                edge.moving = kept or edge.moving[-1:]
-                edge.static = edge.static[-1:]
 
     def _links(self, a: str, b: str) -> list[list[str]]:
         """The frames from a and from b up to the first that both are below, without it."""
@@ -201,6 +199,7 @@ class TfTree:
         edge = self._edges.setdefault(child, {}).setdefault(topic, _Edge())
         transforms = edge.static if transform.stamp_s is None else edge.moving
         transforms.append(transform._replace(parent=parent, child=child))
+        del transforms[: -self._most]
 
     def _edge(self, child: str) -> _Edge:
         topics = self._edges[child]
