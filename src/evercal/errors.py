@@ -21,7 +21,11 @@ NO_WHEELS = {
         "which has no wheel for Linux arm64: make the model with COLMAP itself"
         " (apt-get install colmap), models are read without pycolmap; or reconstruct on another"
         " computer"
-    )
+    ),
+    ("ros2", "Linux", "aarch64"): (
+        "and cyclonedds has no wheel for Linux arm64: build it there from its source package and"
+        " Cyclone DDS, or run evercal on another computer of the same network"
+    ),
 }
 """The way on where an extra has no wheels, by extra, system and machine."""
 

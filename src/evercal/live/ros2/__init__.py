@@ -3,4 +3,6 @@
 from evercal.errors import optional_module
 
 for _module in ("cyclonedds.idl", "rosbags.typesys"):
-    optional_module(_module, "ros2: needs cyclonedds and rosbags", "ros2")
+    optional_module(
+        _module, "ros2: needs cyclonedds (Python 3.11 to 3.13) and rosbags", "ros2"
+    )
