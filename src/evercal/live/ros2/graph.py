@@ -84,11 +84,19 @@ class Graph:
         )
 
     def subscribe(
-        self, topic: str, kind: str, reliable: bool, depth: int = 1
+        self,
+        topic: str,
+        kind: str,
+        reliable: bool,
+        latched: bool = False,
+        depth: int = 1,
     ) -> "Subscription":
-        """Read a topic, whoever publishes it; the last `depth` messages wait to be taken."""
+        """Read a topic, whoever publishes it; of a latched one also what was sent before.
+
+        The last `depth` messages wait to be taken.
+        """
         endpoint = Topic(self._participant, f"rt{topic}", _wire(kind))
-        qos = _qos(reliable, topic.endswith("tf_static"), depth)
+        qos = _qos(reliable, latched, depth)
         return Subscription(topic, kind, DataReader(self._participant, endpoint, qos))
 
     def publisher(self, topic: str, kind: str, latched: bool) -> Callable[[Any], None]:

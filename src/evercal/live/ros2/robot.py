@@ -26,8 +26,10 @@ class Ros2Robot:
 
     def __init__(self, frames: FrameNames = UNKNOWN):
         graph = Graph()
-        topics = ("/tf_static", "/tf")
-        self._topics = [graph.subscribe(topic, TF[0], True, _DEPTH) for topic in topics]
+        self._topics = (
+            graph.subscribe("/tf_static", TF[0], True, True, _DEPTH),
+            graph.subscribe("/tf", TF[0], True, False, _DEPTH),
+        )
         self._tree = TfTree("ros2:/tf", most=_MOST)
         self._zero_ns = time.time_ns()
         self._lock = threading.Lock()
@@ -60,7 +62,9 @@ class Ros2Robot:
                         base, gripper, np.array([wanted])
                     )
                     # Infinite if nothing moves.
-                    if valid[0] and (stamp_s or until > before or before == np.inf):
+                    if valid[0] and (
+                        stamp_s is not None or until > before or before == np.inf
+                    ):
                         return poses[0]
                     problem = (
                         f"ros2:/tf: no pose of {gripper} in {base} at the time asked for,"

@@ -1,0 +1,117 @@
+"""`record`, `track --publish` and `export --publish` in graphs of several processes."""
+
+import io
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds")
+pytest.importorskip("rosbags")
+
+from scipy.spatial.transform import Rotation
+
+from evercal import cli
+from evercal.geometry import SE3, UncertainPose
+from evercal.live.ros2.graph import Graph
+from evercal.live.ros2.publishing import POSE, PosePublisher, about_fixed_axes
+from evercal.live.sources import open_robot
+from evercal.recordings import load_recording
+from evercal.robot.frame_names import FrameNames
+
+from .graphs import driver, environment
+
+RAW = "ros2:/camera/image_raw"
+
+
+@pytest.fixture(autouse=True)
+def on_loopback(monkeypatch):
+    for name, value in environment().items():
+        monkeypatch.setenv(name, value)
+
+
+def tell(process, value):
+    process.stdin.write(f"{value}\n")
+    process.stdin.flush()
+
+
+def test_a_sample_wherever_the_arm_stands_anew(tmp_path):
+    out = tmp_path / "recording"
+    words = ["record", RAW, str(out), "--most", "3", "--json"]
+    codes = []
+    with (
+        driver("arm") as arm,
+        driver("camera", "raw", "reliable", "64x48") as camera,
+    ):
+        recorder = threading.Thread(target=lambda: codes.append(cli.main(words)))
+        recorder.start()
+        for number in range(3):
+            end = time.monotonic() + 20
+            while not (out / f"images/{number:04d}.jpg").exists():
+                assert time.monotonic() < end
+                time.sleep(0.02)
+            tell(camera, 60 * (number + 1))
+            tell(arm, 0.3 * (number + 1))
+        recorder.join(20)
+    assert codes == [1]  # three samples are too few to learn
+    recording = load_recording(out)
+    assert recording.frames == FrameNames("base_link", "tool0", "wrist_optical")
+    assert len(recording.train) == 3
+    assert recording.train[0].camera.fx == 64
+    for number, frame in enumerate(recording.train):
+        turn = frame.base_from_gripper.rotation.as_rotvec()
+        np.testing.assert_allclose(turn, (0, 0, 0.3 * number), atol=1e-7)
+        assert abs(int(frame.read_image()[-1, -1, 0]) - 60 * number) < 3
+
+
+def test_a_sample_by_key_with_poses_of_ones_own_driver(tmp_path, monkeypatch):
+    poses = tmp_path / "poses.csv"
+    poses.write_text("x,y,z,qw,qx,qy,qz\n0.1,0.2,0.3,1,0,0,0\n")
+    out = tmp_path / "recording"
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n\n"))
+    words = ["record", RAW, str(out), "--poses", str(poses), "--key"]
+    with driver("camera", "compressed", "reliable", "64x48"):
+        words[1] = f"{RAW}/compressed"
+        assert cli.main([*words, "--base-frame", "base"]) == 1
+    recording = load_recording(out)
+    assert len(recording.train) == 2
+    assert recording.frames == FrameNames("base", "", "wrist_optical")
+
+
+def test_a_recording_needs_poses(tmp_path, capsys):
+    assert cli.main(["record", "0", str(tmp_path)]) == 2
+    assert "no --poses given" in capsys.readouterr().err
+
+
+def test_covariances_about_fixed_axes():
+    rng = np.random.default_rng(4)
+    root = 1e-3 * rng.normal(size=(6, 6))
+    pose = UncertainPose(SE3.exp(rng.normal(size=6)), root @ root.T)
+    errors = rng.multivariate_normal(np.zeros(6), pose.covariance, 100_000)
+    own = pose.pose.rotation
+    wrong = own * Rotation.from_rotvec(errors[:, 3:])
+    fixed = (wrong * own.inv()).as_rotvec()  # about the axes of the parent
+    sampled = np.cov(np.hstack([errors[:, :3], fixed]).T)
+    scale = np.abs(sampled).max()
+    np.testing.assert_allclose(about_fixed_axes(pose), sampled, atol=0.02 * scale)
+
+
+def test_a_late_program_receives_a_published_calibration(tmp_path):
+    pose = SE3.exp([0.5, -0.2, 0.8, 0.3, 2.0, -0.4])
+    root = 1e-3 * np.random.default_rng(1).normal(size=(6, 6))
+    uncertain = UncertainPose(pose, root @ root.T)
+    publisher = PosePublisher("base_link", "tripod-optical", static=True)
+    publisher.publish(uncertain, 12.5)
+    graph = Graph()
+    stated = graph.subscribe("/evercal/tripod_optical/pose", POSE, True, latched=True)
+    robot = open_robot("ros2:", FrameNames("base_link", "tripod-optical"))
+    heard = robot.base_from_gripper()
+    np.testing.assert_allclose(heard.matrix(), pose.matrix(), atol=1e-12)
+    message = stated.take()[0].content
+    assert message.header.frame_id == "base_link"
+    assert message.header.stamp.nanosec == 5 * 10**8
+    covariance = message.pose.covariance.reshape(6, 6)
+    np.testing.assert_allclose(covariance, about_fixed_axes(uncertain))
+    del publisher
