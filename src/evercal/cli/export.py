@@ -106,8 +106,8 @@ class Export(args.Verb):
         publisher = PosePublisher(export.parent, export.child, static=True)
         publisher.publish(calibration.uncertain_pose, time.time())
         where = " and ".join(publisher.topics)
-        line = f"published on {where}: {calibration.meaning}"
-        self.wait({"topics": publisher.topics}, line)
+        record = {"topics": publisher.topics}
+        self.wait(record, f"published on {where}", f"  {calibration.meaning}")
 
     def _show(self, exported: "Exported", verdict: str) -> None:
         calibration = exported.calibration
