@@ -66,6 +66,8 @@ def test_surfaces_are_the_pixels_near_landmarks_at_about_their_depths(
     ratio = local[:, 2] / view.depths_m[apart.argmin(axis=1)]
     assert np.median(ratio) == pytest.approx(1, abs=0.02)
     assert len(shown) > 3 * len(marks)
+    spacing_px = shown.sigma_mm / 1000 * view.camera.fx / np.linalg.norm(local, axis=1)
+    np.testing.assert_allclose(spacing_px, 2, rtol=1e-6)
 
 
 def test_deviation_is_the_distance_by_which_the_depth_moves_a_landmark(

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, UncertainPose, norms
+from evercal.mapping.landmarks import Landmarks
 from evercal.mapping.scene_map import SceneMap
 from evercal.reports.charts import Panel, Shape
 from evercal.reports.overlay import colour_map
@@ -27,7 +28,7 @@ _SCALES = (500, 200, 100, 50, 20, 10, 5, 2)
 """Factors that enlarge drawn ellipsoids."""
 MOST_POINTS = 50_000
 """Landmarks that are shown of all scenes together; more are thinned out evenly."""
-_MOST_PIXELS = 150_000
+_MOST_PIXELS = 120_000
 """Pixels that are shown around the landmarks of a scene."""
 _PATCH_PX = 11.0
 """Radius of the surface that is shown around a landmark, pixels of its keyframe."""
@@ -167,7 +168,10 @@ class Landmarks3D:
 
 
 def surface(scene: SceneMap) -> Landmarks3D:
-    """The pixels around landmarks as landmarks, on the planes of the slopes that were measured."""
+    """The pixels around landmarks as landmarks, on the planes of the slopes that were measured.
+
+    Their `sigma_mm` is their distance from the next one.
+    """
     patches = []
     for camera, marks in zip(
         scene.keyframes.cameras, scene.keyframes.landmarks, strict=True
@@ -178,8 +182,10 @@ def surface(scene: SceneMap) -> Landmarks3D:
         near = distance < _PATCH_PX
         own = marks.take(nearest[near])
         change = (own.slope * (pixels[near] - own.pixels)).sum(axis=1)
+        change = np.maximum(change, -own.inverse_depth / 2)  # at most twice as far
         inverse = own.inverse_depth + change
-        patches.append(replace(own, pixels=pixels[near], inverse_depth=inverse))
+        apart = inverse * _STEP_PX / camera.fx
+        patches.append(Landmarks(pixels[near], inverse, own.slope, apart))
     keyframes = replace(scene.keyframes, landmarks=tuple(patches))
     return Landmarks3D.of(replace(scene, keyframes=keyframes), _MOST_PIXELS)
 

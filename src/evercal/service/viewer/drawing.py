@@ -30,10 +30,8 @@ from evercal.service.viewer.html import BLUE, MAGENTA, PALE, Colour
 OnKeyframe = Callable[[KeyframeView, viser.ClientHandle], Any]
 GRIPPER = "/gripper"
 """Node of what moves with the gripper."""
-_PIXEL = 0.009
-"""Size of a pixel of a surface, relative to the extent of the first scene."""
-_LANDMARK = 0.005
-"""Size of a landmark, relative to the same."""
+_PIXEL = 0.0008
+"""Size of a pixel of a surface, metres per millimetre from the next one."""
 
 
 def add_frustum(
@@ -99,7 +97,6 @@ class DrawnMap:
     ):
         self.landmarks = {scene.name: Landmarks3D.of(scene) for scene in scenes}
         self.keyframes = {scene.name: keyframe_views(scene) for scene in scenes}
-        self._surfaces = {scene.name: surface(scene) for scene in scenes}
         # Twice the median distance of landmarks from their median.
         points = self.landmarks[scenes[0].name].points_m
         distances = norms(points - np.median(points, axis=0))
@@ -107,11 +104,13 @@ class DrawnMap:
         self.frustum_m = 0.03 * self.extent_m
         self._nodes: dict[str, viser.FrameHandle] = {}
         self._clouds: dict[str, viser.PointCloudHandle] = {}
+        self._surfaces: list[viser.PointCloudHandle] = []
         self._cameras: list[viser.CameraFrustumHandle] = []
         server.scene.remove_by_name("/map")
         with server.atomic():
             for scene in scenes:
                 self._add(server, scene.name, on_keyframe)
+                self._add_surface(server, scene)
             self.colour_by("image")
         self.show(scenes[0].name)
 
@@ -143,14 +142,26 @@ class DrawnMap:
     def colour_by(self, by: ColourBy) -> None:
         """Show the surface as in the images, or landmarks in the colour of a value."""
         for name, cloud in self._clouds.items():
-            shown = self.landmarks[name]
-            size = _LANDMARK
-            if by == "image":
-                shown = self._surfaces[name]
-                size = _PIXEL
-            cloud.point_size = size * self.extent_m
-            cloud.points = shown.points_m.astype(np.float32)
-            cloud.colors = shown.colours(by)
+            cloud.colors = self.landmarks[name].colours(by)
+            cloud.visible = by != "image"
+        for cloud in self._surfaces:
+            cloud.visible = by == "image"
+
+    def _add_surface(self, server: viser.ViserServer, scene: SceneMap) -> None:
+        """Pixels of one size are one node."""
+        pixels = surface(scene)
+        powers = np.round(np.log2(pixels.sigma_mm))
+        for power in np.unique(powers).tolist():
+            chosen = powers == power
+            cloud = server.scene.add_point_cloud(
+                f"{self.node(scene.name)}/surface {power:g}",
+                pixels.points_m[chosen].astype(np.float32),
+                pixels.colours("image")[chosen],
+                point_size=_PIXEL * 2.0**power,
+                precision="float32",
+                point_shading="flat",
+            )
+            self._surfaces.append(cloud)
 
     def _add(
         self, server: viser.ViserServer, name: str, on_keyframe: OnKeyframe | None
@@ -159,11 +170,11 @@ class DrawnMap:
         self._nodes[name] = server.scene.add_frame(node, show_axes=False)
         self._clouds[name] = server.scene.add_point_cloud(
             f"{node}/landmarks",
-            np.zeros((0, 3), np.float32),
-            np.zeros((0, 3), np.uint8),
+            self.landmarks[name].points_m.astype(np.float32),
+            (0, 0, 0),
+            point_size=0.005 * self.extent_m,
             point_shape="circle",
             precision="float32",
-            point_shading="flat",
         )
         if on_keyframe is None:
             return
