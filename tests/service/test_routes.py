@@ -202,3 +202,12 @@ def test_stream_of_frames(hall_service, image, hall):
         socket.send("{")
         socket.send(image.read_bytes())
         assert json.loads(socket.recv())["error"].startswith("camera: ")
+
+
+def test_fields_that_a_page_sends_empty_are_not_given(hall_service, image):
+    empty = {"camera": "", "scene": ""}
+    got = hall_service.post("/localize", image=image, **empty)
+    assert got.json["status"] == "ok"
+    empty |= {"robot_poses": "", "convention": "", "mount": ""}
+    got = hall_service.post("/calibrations", images=image, **empty)
+    assert got.json["mount"] == "eye_to_hand"

@@ -48,9 +48,10 @@ class LiveMap:
             raise UnavailableError(self.fault or str(error)) from None
 
     def within(self, scenes: Sequence[str]) -> Localizer:
-        """The localizer of some scenes, or of all where none is named."""
+        """The localizer of some scenes, or of all where none is named; pages send empty names."""
         localizer = self.localizer
-        return localizer.within(scenes) if scenes else localizer
+        named = [*filter(None, scenes)]
+        return localizer.within(named) if named else localizer
 
     def refresh(self) -> bool:
         """Open the map again if another process has changed it; True if that was tried.

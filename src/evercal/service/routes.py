@@ -74,6 +74,7 @@ Scenes = Annotated[
     Strings,
     Form(
         default_factory=tuple,
+        examples=[[]],
         description="Names of scenes; others are not considered.",
     ),
 ]
@@ -81,6 +82,7 @@ Convention = Annotated[
     str,
     Form(
         default_factory=str,
+        examples=[""],
         description="Of the numbers in `robot_poses`, such as `kuka` or `ur`.",
     ),
 ]
