@@ -70,6 +70,7 @@ VERBS = {
     "networks": ("networks", "the experiments on networks; the paper's table on a GPU"),
     "wheels": ("wheels", "what lacks wheels on the platforms of docs/install.md"),
     "verify": ("verify", "calibrations that err as stated, or more"),
+    "fast-dds": ("fast_dds", "ROS 2 topics between evercal and Fast DDS"),
     "tables": ("tables", "print the tables of the docs from results/"),
 }
 """Module and summary of every verb."""
