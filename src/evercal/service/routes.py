@@ -43,8 +43,6 @@ from evercal.service.limits import (
 from evercal.service.live_map import LiveMap
 from evercal.service.schemas import (
     FILE,
-    IMAGES,
-    SERVICE,
     CalibrationFile,
     CameraShift,
     Estimate,
@@ -137,7 +135,7 @@ async def index() -> Response:
 
 @router.get(
     "/health",
-    tags=[SERVICE],
+    tags=["service"],
     response_model=Health,
     responses={503: {"model": Health, "description": "The map cannot be read."}},
 )
@@ -154,7 +152,7 @@ async def health(service: Asked) -> Response:
     return _json(content, status)
 
 
-@router.get("/scenes", tags=[SERVICE], response_model=SceneNames)
+@router.get("/scenes", tags=["service"], response_model=SceneNames)
 async def scenes(service: Asked) -> Response:
     """Names of the scenes, in order of learning."""
     return _json({"scenes": service.live.current.scenes})
@@ -162,7 +160,7 @@ async def scenes(service: Asked) -> Response:
 
 @router.post(
     "/localize",
-    tags=[IMAGES],
+    tags=["images"],
     response_model=Estimate,
     dependencies=[form("image", "camera", "scene")],
 )
@@ -226,7 +224,7 @@ Decode = Annotated[Callable[[Check], Images], Depends(_decode)]
 
 @router.post(
     "/calibrations",
-    tags=[IMAGES],
+    tags=["images"],
     response_model=CalibrationFile,
     dependencies=[form(*_SHOTS, "scene", "mount")],
 )
@@ -253,7 +251,7 @@ async def calibrate(
 
 @router.post(
     "/check",
-    tags=[IMAGES],
+    tags=["images"],
     response_model=CameraShift,
     dependencies=[form(*_SHOTS, "scene", "calibration")],
 )
@@ -302,7 +300,7 @@ async def _content(file: Upload | None) -> bytes | None:
 
 @router.get(
     "/metrics",
-    tags=[SERVICE],
+    tags=["service"],
     response_class=Response,
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
 )

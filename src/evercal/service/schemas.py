@@ -3,10 +3,10 @@
 Answers are not made from these types, only described: tests compare them with what is sent.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from fastapi import UploadFile
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 from pydantic_core import PydanticCustomError
 
 from evercal.calibration.calibration import ErrorTerm
@@ -37,17 +37,11 @@ counts. A text message from you holds the intrinsics of the frames that follow. 
 drops all but the newest of the frames that wait. `scene=NAME` locates in this scene only.
 """
 """Beginning of the page."""
-IMAGES = "images"
-"""Tag of what takes images."""
-SERVICE = "service"
-"""Tag of what tells about the service."""
 TAGS = [
-    {"name": IMAGES, "description": "Locate images; calibrate and check cameras."},
-    {"name": SERVICE, "description": "What is served, and whether it is well."},
+    {"name": "images", "description": "Locate images; calibrate and check cameras."},
+    {"name": "service", "description": "What is served, and whether it is well."},
 ]
 """Groups of the page."""
-Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
-Quaternion = Annotated[list[float], Field(min_length=4, max_length=4)]
 Matrix = list[list[float]]
 """Rows."""
 
@@ -103,10 +97,10 @@ class SceneNames(Record):
 class Pose(Record):
     """A rigid transform."""
 
-    translation_m: Vector
-    """Metres; of a map without scale in its own unit."""
-    quaternion_wxyz: Quaternion
-    """Unit quaternion."""
+    translation_m: list[float]
+    """(3,) metres; of a map without scale in its own unit."""
+    quaternion_wxyz: list[float]
+    """(4,)."""
 
 
 class MatrixPose(Pose):
