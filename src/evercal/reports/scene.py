@@ -177,8 +177,8 @@ def surface(scene: SceneMap) -> Landmarks3D:
         scene.keyframes.cameras, scene.keyframes.landmarks, strict=True
     ):
         every = np.mgrid[: camera.height : _STEP_PX, : camera.width : _STEP_PX]
-        pixels = every[::-1].reshape(2, -1).T
-        distance, nearest = KDTree(marks.pixels).query(pixels)
+        pixels = np.reshape(every, (2, -1)).T[:, ::-1]
+        distance, nearest = map(np.asarray, KDTree(marks.pixels).query(pixels))
         near = distance < _PATCH_PX
         own = marks.take(nearest[near])
         change = (own.slope * (pixels[near] - own.pixels)).sum(axis=1)
