@@ -36,6 +36,8 @@ from evercal.service.viewer.overview import FOV_RAD, WINDOW_PX, overview
 
 _THROUGH = "/through"
 """Node of the image behind the landmarks of a keyframe."""
+_PANEL_PX = 384
+"""Width of the panel."""
 _NEAREST = 92
 """Landmarks in the overview, percent; the others are far away, such as behind a window."""
 
@@ -250,8 +252,7 @@ def start_server(host: str, port: int, label: str) -> _Server:
     with gated(key, is_local(host)), contextlib.redirect_stdout(io.StringIO()):
         server = _Server(host, port, label=label, verbose=False)
     server.key = key
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()
-    server.gui.configure_theme(
-        show_logo=False, show_share_button=False, control_width="large"
-    )
+    server.gui.main_panel.set_width(_PANEL_PX)
     return server
