@@ -2,10 +2,10 @@
 
     python examples/08_http.py [MAP]
 
-A missing map (default: cell.evercal) is learned from the packaged robot cell, in half a minute.
-It needs the extra `serve`.
+A missing map (default: cell.evercal) is learned from the packaged robot cell. Needs `serve`.
 """
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -19,11 +19,12 @@ def main(path: Path) -> None:
     cell = evercal.Map.open(path)
     if not cell.scenes:
         cell.learn(CELL / "wrist")
-    command = [sys.executable, "-m", "evercal", "serve", str(path), "--port", "0"]
+    command = [sys.executable, "-m", "evercal", "serve", str(path)]
+    command += ["--port", "0", "--json"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as service:
         try:
-            address = next(service.stdout).partition(" at ")[2].partition(";")[0]
-            client = evercal.Client(address)  # this could be another computer
+            url = json.loads(next(service.stdout))["url"]
+            client = evercal.Client(url)  # this could be another computer
             estimate = client.localize(CELL / "bumped.jpg")
             print(f"{estimate.status}: {estimate.base_from_camera}")
             calibration = client.calibrate(CELL / "tripod")
