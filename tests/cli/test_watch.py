@@ -11,6 +11,7 @@ import pytest
 
 from evercal.cli import main
 from evercal.cli.watch import FALSE_ALARMS, Arrivals, false_alarm_share
+from evercal.live import sources
 from evercal.recordings import read_image, write_image
 
 from .conftest import words_of
@@ -68,9 +69,20 @@ def test_half_written_file_is_read_when_it_is_complete(four_images, tmp_path):
     assert list(arrivals.scan()) == []
     path.write_bytes(data)
     [(arrived, pixels)] = arrivals.scan()
-    assert arrived == path
+    assert arrived == "late.png"
     np.testing.assert_array_equal(pixels, read_image(path))
     assert list(arrivals.scan()) == []
+
+
+def test_a_moved_camera_is_watched_as_it_runs(run, words, hall, monkeypatch):
+    class Running:
+        def read(self):
+            return 12.5, hall.test[6].read_image()
+
+    monkeypatch.setattr(sources, "open_camera", lambda source: Running())
+    ran = run(*words[:2], "ros2:/camera/image_raw", *words[3:], "--window 3")
+    assert ran.code == 1
+    assert [line.split()[1] for line in ran.out.splitlines()] == ["12.500:"] * 3
 
 
 def test_broken_file_does_not_end_the_watch_nor_prolong_it(

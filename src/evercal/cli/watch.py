@@ -4,13 +4,13 @@ import math
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 from evercal.classes import frozen
 from evercal.cli import args
@@ -29,7 +29,7 @@ FALSE_ALARMS = 0.01
 
 @frozen
 class Watch(args.Verb):
-    """Watch a folder of arriving images; stop with exit code 1 when the camera has moved.
+    """Watch a camera, or a folder of arriving images; stop with exit code 1 when it has moved.
 
     The newest images are tested together, so that a single outlier raises no alarm. With --json,
     every image gives one object.
@@ -38,13 +38,13 @@ class Watch(args.Verb):
     """
 
     store: args.Store
-    folder: args.InFolder
-    """Folder that images arrive in."""
+    source: Annotated[Positional[str], arg(metavar="SOURCE")]
+    """Folder that images arrive in, or a camera: ros2:/camera/image_raw, rtsp://..., 0."""
     reference: Reference
     window: args.Number = 5
     """Newest images that are tested together."""
     interval: Annotated[float, arg(metavar="SECONDS")] = 1.0
-    """Interval between scans of the folder."""
+    """Interval between scans of the folder, or images of the camera."""
     idle: args.Seconds = None
     """Stop with exit code 0 after this time without a new image. Default: never."""
     scene: args.Scenes = ()
@@ -52,10 +52,6 @@ class Watch(args.Verb):
     """Intrinsics. Default: those of the reference."""
 
     def run(self) -> int:
-        if not self.folder.is_dir():
-            raise InputError(
-                f"{self.folder}: no such folder; give the one that images arrive in"
-            )
         if self.window < 1 or self.interval <= 0:
             raise InputError("--window is at least 1 and --interval is above 0")
         from evercal.calibration.calibration import read_calibration
@@ -65,40 +61,60 @@ class Watch(args.Verb):
         reference = read_calibration(self.reference)
         localizer = args.open_map(self.store, self.scene)
         recent: deque[ImagePose] = deque(maxlen=self.window)
-        arrivals = Arrivals(self.folder)
+        arrivals = arrivals_of(self.source)
         tests = 0
         last = time.monotonic()
         while self.idle is None or time.monotonic() - last < self.idle:
-            for path, pixels in arrivals.scan():
+            for name, pixels in arrivals():
                 height, width = pixels.shape[:2]
                 camera = (
                     args.stated_camera(self.camera, (width, height)) or reference.camera
                 )
                 try:
-                    recent.extend(locate(localizer, [(path.name, pixels)], camera))
+                    recent.extend(locate(localizer, [(name, pixels)], camera))
                 except InputError as error:
-                    say(f"warning: {path}: {error}; skipped", sys.stderr)
+                    say(f"warning: {name}: {error}; skipped", sys.stderr)
                     continue
                 last = time.monotonic()
                 if not any(image.is_located for image in recent):
                     reason = recent[-1].estimate.reason
-                    self._print(path, {"moved": None, "reason": reason}, reason)
+                    self._print(name, {"moved": None, "reason": reason}, reason)
                     continue
                 tests += 1
                 confidence = 1 - false_alarm_share(tests)
                 shift = shift_between(
                     reference, fuse(recent), list(recent), localizer, confidence
                 )
-                self._print(path, shift_dict(shift), shift_line(shift))
+                self._print(name, shift_dict(shift), shift_line(shift))
                 used = sum(image.used for image in shift.images)
                 if shift.moved and used >= min(3, self.window):
                     return 1
             time.sleep(self.interval)
         return 0
 
-    def _print(self, path: Path, record: dict[str, object], line: str) -> None:
+    def _print(self, name: str, record: dict[str, object], line: str) -> None:
         now = datetime.now(UTC).strftime("%H:%M:%S")
-        self.answer({"image": path.name, **record}, f"{now} {path.name}: {line}")
+        self.answer({"image": name, **record}, f"{now} {name}: {line}")
+
+
+def arrivals_of(source: str) -> "Callable[[], Iterable[tuple[str, np.ndarray]]]":
+    """What has arrived in a folder since the last call, or the newest image of a camera."""
+    from evercal.live.sources import open_camera
+    from evercal.recordings.streams import is_live
+
+    if not is_live(source):
+        if not Path(source).is_dir():
+            raise InputError(
+                f"{source}: no such folder; give the one that images arrive in, or a camera"
+            )
+        return Arrivals(Path(source)).scan
+    camera = open_camera(source)
+
+    def newest() -> "list[tuple[str, np.ndarray]]":
+        stamp_s, image = camera.read()
+        return [(f"{stamp_s:.3f}", image)]
+
+    return newest
 
 
 class Arrivals:
@@ -113,8 +129,8 @@ class Arrivals:
         self._done: set[Path] = set()
         self._broken: dict[Path, tuple[int, int]] = {}
 
-    def scan(self) -> "Iterator[tuple[Path, np.ndarray]]":
-        """Path and pixels of every image that is new and complete, oldest first."""
+    def scan(self) -> "Iterator[tuple[str, np.ndarray]]":
+        """Name and pixels of every image that is new and complete, oldest first."""
         from evercal.recordings import read_image
         from evercal.recordings.images import files_in
 
@@ -136,7 +152,7 @@ class Arrivals:
                 self._broken[path] = states[path]
                 continue
             self._done.add(path)
-            yield path, pixels
+            yield path.name, pixels
 
 
 def false_alarm_share(test: int) -> float:
