@@ -35,8 +35,9 @@ def test_it_serves_a_page_and_ends_cleanly(verb, hall_store, tmp_path):
             assert process.stderr is not None
             url = json.loads(process.stdout.readline())["url"]
             assert url.startswith("http://127.0.0.1:")
-            with urllib.request.urlopen(url, timeout=60) as page:
-                assert b"<html" in page.read()
+            page = f"{url}?light"  # the address itself chooses by the colours of the system
+            with urllib.request.urlopen(page, timeout=60) as answer:
+                assert b"<html" in answer.read()
             process.send_signal(signal.SIGTERM)
             assert process.wait(120) == 0
             assert (process.stdout.read(), process.stderr.read()) == ("", "")
