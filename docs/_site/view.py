@@ -26,10 +26,11 @@ def main(store: Path, calibration: Path, images: Path) -> None:
             visit = browser.new_page(viewport={"width": 1200, "height": 720})
             visit.goto(page.server.url)
             visit.wait_for_selector("canvas", timeout=120_000)
-            page.track(str(images))
             # viser's notice that WebGL runs in software
             visit.add_style_tag(content=".mantine-Notifications-root {display: none}")
             time.sleep(20)  # all parts have arrived
+            page.track(str(images))
+            time.sleep(4)
             shot = Image.open(io.BytesIO(visit.screenshot(timeout=120_000)))
             shot.convert("RGB").save(OUT, quality=80)
     finally:
