@@ -13,7 +13,7 @@ from typing import Any
 @contextmanager
 def visited(browser: Any, url: str) -> Iterator[Any]:
     """A visit of a page without errors of its scripts and requests to other places."""
-    visit = browser.new_page(viewport={"width": 1200, "height": 720})
+    visit = browser.new_page(viewport={"width": 1200, "height": 800})
     errors = []
     visit.on("pageerror", lambda error: errors.append(str(error)))
     own = (url, "data:", "blob:")

@@ -62,7 +62,7 @@ def test_from_an_empty_folder_to_both_calibrations(browser, tmp_path):
         millimetres, degrees = pose_distance_mm_deg(found, true)
         assert millimetres < 1
         assert degrees < 0.05
-        assert (tmp_path / f"export/{name}.calib").is_file()
+        assert (tmp_path / f"export/{name}_opencv.yml").is_file()
 
 
 def record(visit: Any, root: Path) -> None:
@@ -75,8 +75,10 @@ def record(visit: Any, root: Path) -> None:
     seen_until(visit, "The arm is there.")
     visit.keyboard.press("t")
     seen_until(visit, "Took sample 0001.jpg.")
+    visit.get_by_text("Samples", exact=True).first.click()
     click(visit, "Remove")
     seen_until(visit, "Removed 0001.jpg.")
+    visit.get_by_text("Samples", exact=True).first.click()
     assert [f.name for f in load_recording(root / "wrist").train] == ["0000.jpg"]
     click(visit, "Record by itself")
     seen_until(visit, "samples are recorded.", 900)

@@ -200,7 +200,7 @@ class Controls:
 
     def _learn(self) -> None:
         learn = partial(self._studio.learn, self._tasks.step)
-        self._button("Learn the recording", learn, first=lambda: True)
+        self._button("Learn the recording", learn, first=self._studio.samples_changed)
         self._keep(self._gui.add_html(""), content=lambda: self._numbers("wrist"))
 
     def _fixed(self) -> None:

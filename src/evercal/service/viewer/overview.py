@@ -6,8 +6,6 @@ from evercal.typing import Array
 
 FOV_RAD = np.deg2rad(50.0)
 """Vertical angle of view."""
-WINDOW_PX = (1056, 900)
-"""Picture beside the panel of a wide window."""
 _PHONE_PX = 576
 """Width up to which viser lays the panel over the lower part of the picture."""
 _COVERED = 1.2
@@ -19,13 +17,13 @@ _MARGIN = 0.92
 
 
 def overview(
-    points_m: Array, ahead: Array, size_px: tuple[int, int] = WINDOW_PX
+    points_m: Array, ahead: Array, size_px: tuple[int, int]
 ) -> tuple[Array, Array]:
     """Position and target of a view that shows points (n, 3) in a picture.
 
     The visitor looks to `ahead` (3,), whose height does not count.
     """
-    width, height = size_px
+    width, height = np.maximum(size_px, 1)  # a hidden window may have none
     x, y = ahead[:2] / (np.hypot(*ahead[:2]) + 1e-12)
     right = np.array([y, -x, 0.0])
     level = np.cos(_DOWN_RAD)

@@ -6,7 +6,7 @@ import secrets
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 import viser
@@ -32,7 +32,8 @@ from evercal.service.viewer.html import (
     position_mm,
     rows_html,
 )
-from evercal.service.viewer.overview import FOV_RAD, WINDOW_PX, overview
+from evercal.service.viewer.overview import FOV_RAD, overview
+from evercal.typing import Array
 
 _THROUGH = "/through"
 """Node of the image behind the landmarks of a keyframe."""
@@ -76,8 +77,8 @@ class Page:
                 view = Frustum.of(pose, one.camera or default)
                 self._outlines.append(view.corners(size_m))
             self._add_controls(given)
-            self.look_around(server.initial_camera)
-            server.on_client_connect(self._fit)
+            # An initial camera could replace the view that fits a visitor's window.
+            server.on_client_connect(self._begin)
         except BaseException:
             self.close()
             raise
@@ -119,17 +120,30 @@ class Page:
             client.camera.fov = view.frustum.fov_rad
         self.map.show_keyframes(False)  # they stand before the landmarks
 
-    def look_from_above(self, client: viser.ClientHandle) -> None:
+    def _begin(self, client: viser.ClientHandle) -> None:
+        """Show the overview beside the panel, which has no place yet in a wide window."""
+        width = client.camera.image_width
+        if width > 2 * _PANEL_PX:
+            width -= _PANEL_PX
+        self.look_from_above(client, width)
+
+    def look_from_above(
+        self, client: viser.ClientHandle, width_px: int | None = None
+    ) -> None:
         """Bring a visitor back to the first view."""
         camera = client.camera
+        width = width_px or camera.image_width
+        position, target = self._overview((width, camera.image_height))
         with client.atomic():
             client.scene.remove_by_name(_THROUGH)
             camera.up_direction = (0.0, 0.0, 1.0)
-            self.look_around(camera, (camera.image_width, camera.image_height))
+            camera.fov = FOV_RAD
+            camera.position = position
+            camera.look_at = target
         self.map.show_keyframes(True)
 
-    def look_around(self, camera: Any, size_px: tuple[int, int] = WINDOW_PX) -> None:
-        """Turn a camera of viser to landmarks, base, calibrations and arm."""
+    def _overview(self, size_px: tuple[int, int]) -> tuple[Array, Array]:
+        """Landmarks, base, calibrations and gripper."""
         scene = chosen(self._scene)
         points = self.map.landmarks[scene].points_m
         apart = norms(points - np.median(points, axis=0))
@@ -138,12 +152,7 @@ class Page:
         keyframes = self.map.keyframes[scene]
         poses = SE3.stack([view.frustum.base_from_camera for view in keyframes])
         ahead = poses.rotation_matrix()[:, :, 2].mean(axis=0)
-        camera.fov = FOV_RAD
-        camera.position, camera.look_at = overview(points, ahead, size_px)
-
-    def _fit(self, client: viser.ClientHandle) -> None:
-        if client.camera.aspect < 1:
-            self.look_from_above(client)
+        return overview(points, ahead, size_px)
 
     def _add_controls(self, given: dict[str, Calibration]) -> None:
         gui = self.server.gui
