@@ -1,5 +1,6 @@
 """Rendered data in the place of a robot's, for the examples; with your own data, leave them out."""
 
+import time
 from pathlib import Path
 
 import cv2
@@ -57,3 +58,26 @@ def phone_video(file: Path, folder: Path) -> None:
             image = cell.render(look_at(eye, WORK_AREA_M), AWAY_RAD)
             writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     writer.release()
+
+
+class VisitingCell:
+    """A virtual arm that stands at another pose every second, with the camera on it."""
+
+    def __init__(self):
+        self._cell = VirtualCell()
+        self._views = self._cell.reachable_poses(100)
+        self._begun = time.monotonic()
+        self._number = -1
+        self.intrinsics = self._cell.intrinsics
+
+    def base_from_gripper(self) -> SE3:
+        """The stated pose."""
+        number = int(time.monotonic() - self._begun)
+        if number != self._number:
+            self._cell.robot.move_to(self._views[number % len(self._views)])
+            self._number = number
+        return self._cell.robot.base_from_gripper()
+
+    def read(self):
+        """Time and image."""
+        return self._cell.wrist_camera.read()

@@ -12,6 +12,9 @@ import pytest
 
 from evercal.calibration.transform_file import read_transform
 from evercal.geometry import SE3, pose_distance_mm_deg
+from evercal.recordings import load_recording
+
+from .live.ros2.graphs import environment
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 NUMBERED = sorted(EXAMPLES.glob("[0-9]*.py"))
@@ -95,3 +98,30 @@ def test_verify(cell: Path, tmp_path: Path) -> None:
     right, pushed = example("07_verify.py", tmp_path).splitlines()
     assert right.endswith("honest")
     assert pushed.endswith("not as stated")
+
+
+@pytest.fixture
+def _in_own_domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in environment().items():
+        monkeypatch.setenv(name, value)
+
+
+@slow
+@pytest.mark.usefixtures("_in_own_domain")
+def test_ros2(tmp_path: Path) -> None:
+    pytest.importorskip("cyclonedds")
+    pytest.importorskip("rosbags")
+    output = example("09_ros2.py", tmp_path)
+    assert "25 of 25 images are good" in output
+    assert "pose of wrist_optical in tool0" in output
+    assert "on /tf_static and /evercal/wrist_optical/pose" in output
+    truth = json.loads((tmp_path / "virtual/truth.json").read_text("utf-8"))
+    pose = truth["gripper_from_camera"]
+    true = SE3(pose["quaternion_wxyz"], pose["translation_m"])
+    assert pose_distance_mm_deg(read_transform(tmp_path / "wrist.json"), true)[0] < 0.5
+
+
+@slow
+def test_own_driver(tmp_path: Path) -> None:
+    example("10_own_driver.py", tmp_path)
+    assert len(load_recording(tmp_path / "wrist").train) == 25

@@ -1,8 +1,11 @@
 """`evercal record`."""
 
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
-from typing import Annotated
+from itertools import islice
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
@@ -10,6 +13,11 @@ from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import say
 from evercal.errors import InputError
+
+if TYPE_CHECKING:
+    from evercal.geometry import SE3
+    from evercal.live.robot import Robot
+    from evercal.typing import Image
 
 
 @frozen
@@ -31,10 +39,7 @@ class Record(args.Verb):
     Default: ros2: if the source is a topic."""
     pose_convention: args.Name = None
     """Convention of a file of poses if its header does not state it: ur, kuka, fanuc, ..."""
-    base_frame: args.Frame = None
-    """The robot's base in tf. Default: the one with a usual name."""
-    gripper_frame: args.Frame = None
-    """The gripper in tf. Default: the one with a usual name."""
+    named: args.HowNamed = args.Named()
     intrinsics: args.File = None
     """Intrinsics. Default: the camera_info beside the images."""
     key: bool = False
@@ -45,9 +50,8 @@ class Record(args.Verb):
     def run(self) -> int:
         from evercal.live.coverage import Sample, coverage
         from evercal.live.recorder import WristRecorder
-        from evercal.live.sampling import MovedError, sample, wait_at_new_pose
+        from evercal.live.sampling import samples
         from evercal.live.sources import open_camera, open_robot
-        from evercal.robot.frame_names import FrameNames
 
         poses = self.poses
         if poses is None and self.source.startswith("ros2:"):
@@ -56,7 +60,7 @@ class Record(args.Verb):
             raise InputError(
                 "no --poses given: a file of gripper poses, or ros2: for those of tf"
             )
-        names = FrameNames(self.base_frame or "", self.gripper_frame or "")
+        names = self.named.names()
         robot = open_robot(poses, names, self.pose_convention)
         with open_camera(self.source) as camera:
             _, image = camera.read()
@@ -68,28 +72,35 @@ class Record(args.Verb):
                     f"no --intrinsics FILE given, and {self.source} states none"
                 )
             robot.base_from_gripper()
-            names = replace(getattr(robot, "frames", names), camera=camera.frame_id)
+            names = getattr(robot, "frames", names)
+            if camera.frame_id:
+                names = replace(names, camera=camera.frame_id)
             recorder = WristRecorder(self.out, intrinsics, names)
-            samples = [*map(Sample.of, recorder.frames)]
-            try:
-                while self.most is None or len(samples) < self.most:
-                    if not self.key:
-                        known = [one.base_from_gripper for one in samples]
-                        wait_at_new_pose(robot, known)
-                    elif not sys.stdin.readline():
-                        break
-                    try:
-                        frame = recorder.add(*sample(camera.read, robot))
-                    except MovedError as error:
-                        say(f"note: {error}", sys.stderr)
-                        continue
-                    samples.append(Sample.of(frame))
+            taken = [*map(Sample.of, recorder.frames)]
+            known = [one.base_from_gripper for one in taken]
+            left = None if self.most is None else max(0, self.most - len(taken))
+            arriving = samples(camera.read, robot, known)
+            if self.key:
+                arriving = _by_key(camera.read, robot)
+            with suppress(KeyboardInterrupt):
+                for image, pose in islice(arriving, left):
+                    taken.append(Sample.of(recorder.add(image, pose)))
                     if not self.json:
-                        say(f"{frame.name}: {coverage(samples).verdict}")
-            except KeyboardInterrupt:
-                pass
-        covered = coverage(samples)
+                        say(f"{taken[-1].name}: {coverage(taken).verdict}")
+        covered = coverage(taken)
         record = {"recording": str(self.out), "verdict": covered.verdict}
         line = f"wrote {self.out}: {covered.verdict}"
         self.answer(record, line, then=("learn", "MAP", self.out))
         return 0 if covered.ready else 1
+
+
+def _by_key(
+    read: "Callable[[], tuple[float, Image]]", robot: "Robot"
+) -> "Iterator[tuple[Image, SE3]]":
+    from evercal.live.sampling import MovedError, sample
+
+    for _ in sys.stdin:
+        try:
+            yield sample(read, robot)
+        except MovedError as error:
+            say(f"note: {error}", sys.stderr)

@@ -19,8 +19,6 @@ _REAL = (
     "camera",
     "intrinsics",
     "poses",
-    "base_frame",
-    "gripper_frame",
     "pose_convention",
     "most_age",
     "reachable",
@@ -52,10 +50,7 @@ class Studio(PageVerb):
     poses: args.File = None
     """Gripper poses: a table or JSON lines that your robot's program appends to, or `ros2:` for
     those of tf."""
-    base_frame: args.Frame = None
-    """The robot's base in tf. Default: the one with a usual name."""
-    gripper_frame: args.Frame = None
-    """The gripper in tf. Default: the one with a usual name."""
+    named: args.HowNamed = args.Named()
     pose_convention: args.Name = None
     """Convention of --poses if its header does not state it: ur, kuka, fanuc, ..."""
     most_age: Annotated[float | None, args.shown("S")] = None
@@ -144,7 +139,6 @@ class Studio(PageVerb):
         from evercal.live.sources import open_camera, open_robot
         from evercal.recordings import read_robot_poses
         from evercal.recordings.streams import is_live
-        from evercal.robot.frame_names import FrameNames
         from evercal.service.studio.devices import Devices
 
         assert self.poses is not None, "checked before"
@@ -163,7 +157,6 @@ class Studio(PageVerb):
             raise InputError(
                 "no --intrinsics FILE given: a new recording needs the intrinsics"
             )
-        names = FrameNames(self.base_frame or "", self.gripper_frame or "")
         reachable = None
         if self.reachable is not None:
             poses = read_robot_poses(
@@ -173,7 +166,7 @@ class Studio(PageVerb):
         return Devices(
             wrist_camera=wrist,
             intrinsics=camera,
-            robot=open_robot(self.poses, names, convention, self.most_age),
+            robot=open_robot(self.poses, self.named.names(), convention, self.most_age),
             fixed_camera=fixed,
             fixed_intrinsics=_intrinsics(fixed_intrinsics, fixed),
             reachable=reachable,

@@ -1,7 +1,8 @@
 """Samples for a hand-eye calibration: images with the poses of an arm that stands still."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance_mm_deg
@@ -33,8 +34,20 @@ def sample(read: Callable[[], tuple[float, Image]], robot: Robot) -> tuple[Image
     return image, after
 
 
-def wait_at_new_pose(robot: Robot, known: Sequence[SE3]) -> None:
-    """Return once the arm stands still at a pose that differs from all known ones."""
+def samples(
+    read: Callable[[], tuple[float, Image]], robot: Robot, known: Iterable[SE3] = ()
+) -> Iterator[tuple[Image, SE3]]:
+    """A sample wherever the arm stands still at a pose that differs from all known ones."""
+    poses = [*known]
+    while True:
+        _wait_at_new_pose(robot, poses)
+        with suppress(MovedError):
+            image, pose = sample(read, robot)
+            yield image, pose
+            poses.append(pose)
+
+
+def _wait_at_new_pose(robot: Robot, known: Sequence[SE3]) -> None:
     pose = robot.base_from_gripper()
     since = time.monotonic()
     while True:

@@ -1,0 +1,41 @@
+"""Record with your own drivers: one that reads images, and one that states gripper poses.
+
+    python examples/10_own_driver.py [ADDRESS CAMERA.json]
+
+ADDRESS: a controller of Universal Robots (default: a virtual cell). Its class is by the
+documentation of ur_rtde (pip install ur_rtde); it was not run on an arm.
+"""
+
+import sys
+from pathlib import Path
+
+from scipy.spatial.transform import Rotation
+from stand_ins import VisitingCell
+
+from evercal import SE3
+from evercal.live.recorder import WristRecorder
+from evercal.live.sampling import samples
+from evercal.live.sources import open_camera
+from evercal.recordings.cameras.camera_file import read_camera
+
+
+class UniversalRobot:
+    """An arm by RTDE, and a camera by OpenCV."""
+
+    def __init__(self, address: str, intrinsics: str):
+        from rtde_receive import RTDEReceiveInterface
+
+        self._state = RTDEReceiveInterface(address)
+        self.intrinsics = read_camera(Path(intrinsics))
+        self.read = open_camera("0").read  # returns seconds and an RGB image
+
+    def base_from_gripper(self) -> SE3:
+        """The tool in the frame `base` of the controller: metres, rotation vector."""
+        x, y, z, *turn = self._state.getActualTCPPose()
+        return SE3.of(Rotation.from_rotvec(turn), [x, y, z])
+
+
+cell = UniversalRobot(*sys.argv[1:]) if sys.argv[1:] else VisitingCell()
+recorder = WristRecorder(Path("wrist"), cell.intrinsics)
+for _, (image, pose) in zip(range(25), samples(cell.read, cell), strict=False):
+    recorder.add(image, pose)
