@@ -71,6 +71,7 @@ VERBS = {
     "wheels": ("wheels", "what lacks wheels on the platforms of docs/install.md"),
     "verify": ("verify", "calibrations that err as stated, or more"),
     "fast-dds": ("fast_dds", "ROS 2 topics between evercal and Fast DDS"),
+    "ros2": ("ros2", "a ROS 2 graph of three processes: samples, rates, CPU"),
     "tables": ("tables", "print the tables of the docs from results/"),
 }
 """Module and summary of every verb."""

@@ -2,8 +2,7 @@
 
     python examples/10_own_driver.py [ADDRESS CAMERA.json]
 
-ADDRESS: a controller of Universal Robots (default: a virtual cell). Its class is by the
-documentation of ur_rtde (pip install ur_rtde); it was not run on an arm.
+ADDRESS: a UR controller, by the documentation of ur_rtde, not run on an arm; else a virtual cell.
 """
 
 import sys
@@ -23,7 +22,7 @@ class UniversalRobot:
     """An arm by RTDE, and a camera by OpenCV."""
 
     def __init__(self, address: str, intrinsics: str):
-        from rtde_receive import RTDEReceiveInterface
+        from rtde_receive import RTDEReceiveInterface  # pip install ur_rtde
 
         self._state = RTDEReceiveInterface(address)
         self.intrinsics = read_camera(Path(intrinsics))

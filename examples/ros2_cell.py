@@ -25,13 +25,18 @@ DWELL_S = 1.5
 
 
 @contextmanager
-def virtual_cell() -> Iterator[None]:
+def virtual_cell(folder: Path = Path("virtual")) -> Iterator[None]:
     """Record a virtual cell; an arm and a camera in it run as two processes."""
-    list(record_cell(Path("virtual")))
+    list(record_cell(folder))
     command = [sys.executable, __file__]
-    run = [[*command, what, "virtual/wrist"] for what in ("arm", "camera")]
-    with subprocess.Popen(run[0]) as first, subprocess.Popen(run[1]) as second:
+    run = [[*command, what, str(folder / "wrist")] for what in ("arm", "camera")]
+    pipe = subprocess.PIPE
+    with (
+        subprocess.Popen(run[0]) as first,
+        subprocess.Popen(run[1], stdout=pipe) as second,
+    ):
         try:
+            second.stdout.readline()  # it shows images
             yield
         finally:
             first.kill()
@@ -68,6 +73,8 @@ def camera(recording) -> None:
     words += (np.eye(3, 4).ravel(), 0, 0, roi)
     size = (own.height, own.width)
     robot = open_robot("ros2:")
+    robot.base_from_gripper()
+    print("ready", flush=True)
     while True:
         pose = robot.base_from_gripper()
         image = images[int(np.argmin(pose_distance(pose, poses)[0]))]

@@ -7,6 +7,7 @@ a second.
 """
 
 import os
+import threading
 import time
 from collections.abc import Callable
 from functools import cache
@@ -39,6 +40,8 @@ _MANY = 10_000
 """More than arrive at once."""
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 """Types of messages; those used here never changed."""
+_ONE = threading.Lock()
+"""Cyclone refuses topics that threads describe at the same time."""
 _PLAIN = {"string": str, "bool": bool}
 
 
@@ -95,20 +98,24 @@ class Graph:
 
         The last `depth` messages wait to be taken.
         """
-        endpoint = Topic(self._participant, f"rt{topic}", _wire(kind))
         qos = _qos(reliable, latched, depth)
-        return Subscription(topic, kind, DataReader(self._participant, endpoint, qos))
+        reader = DataReader(self._participant, self._topic(topic, kind), qos)
+        return Subscription(topic, kind, reader)
 
     def publisher(self, topic: str, kind: str, latched: bool) -> Callable[[Any], None]:
         """A function that sends a message; a latched one also reaches readers that come later."""
-        endpoint = Topic(self._participant, f"rt{topic}", _wire(kind))
-        writer = DataWriter(self._participant, endpoint, _qos(True, latched, 1))
+        own = self._topic(topic, kind)
+        writer = DataWriter(self._participant, own, _qos(True, latched, 1))
 
         def publish(message: Any) -> None:
             data = _STORE.serialize_cdr(message, kind)
             writer.write(_wire(kind)(bytes(data)))
 
         return publish
+
+    def _topic(self, topic: str, kind: str) -> Topic[Any]:
+        with _ONE:
+            return Topic(self._participant, f"rt{topic}", _wire(kind))
 
 
 class Subscription:
