@@ -1,11 +1,10 @@
 """`evercal record`."""
 
 import sys
-from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
@@ -13,11 +12,6 @@ from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.console import say
 from evercal.errors import InputError
-
-if TYPE_CHECKING:
-    from evercal.geometry import SE3
-    from evercal.live.robot import Robot
-    from evercal.typing import Image
 
 
 @frozen
@@ -43,7 +37,7 @@ class Record(args.Verb):
     intrinsics: args.File = None
     """Intrinsics. Default: the camera_info beside the images."""
     key: bool = False
-    """Take a sample at every press of Enter instead; end with Ctrl-D."""
+    """Take a sample at every press of Enter, once the arm stands; end with Ctrl-D."""
     most: args.Count = None
     """Stop when OUT holds so many samples."""
 
@@ -79,9 +73,8 @@ class Record(args.Verb):
             taken = [*map(Sample.of, recorder.frames)]
             known = [one.base_from_gripper for one in taken]
             left = None if self.most is None else max(0, self.most - len(taken))
-            arriving = samples(camera.read, robot, known)
-            if self.key:
-                arriving = _by_key(camera.read, robot)
+            asked = sys.stdin if self.key else None
+            arriving = samples(camera.read, robot, known, asked)
             with suppress(KeyboardInterrupt):
                 for image, pose in islice(arriving, left):
                     taken.append(Sample.of(recorder.add(image, pose)))
@@ -92,15 +85,3 @@ class Record(args.Verb):
         line = f"wrote {self.out}: {covered.verdict}"
         self.answer(record, line, then=("learn", "MAP", self.out))
         return 0 if covered.ready else 1
-
-
-def _by_key(
-    read: "Callable[[], tuple[float, Image]]", robot: "Robot"
-) -> "Iterator[tuple[Image, SE3]]":
-    from evercal.live.sampling import MovedError, sample
-
-    for _ in sys.stdin:
-        try:
-            yield sample(read, robot)
-        except MovedError as error:
-            say(f"note: {error}", sys.stderr)

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from itertools import repeat
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance_mm_deg
@@ -35,30 +36,34 @@ def sample(read: Callable[[], tuple[float, Image]], robot: Robot) -> tuple[Image
 
 
 def samples(
-    read: Callable[[], tuple[float, Image]], robot: Robot, known: Iterable[SE3] = ()
+    read: Callable[[], tuple[float, Image]],
+    robot: Robot,
+    known: Iterable[SE3] = (),
+    asked: Iterable[object] | None = None,
 ) -> Iterator[tuple[Image, SE3]]:
-    """A sample wherever the arm stands still at a pose that differs from all known ones."""
+    """A sample wherever the arm stands still at a pose that differs from all known ones.
+
+    With `asked`, such as lines of the keyboard, one for each of its values, once the arm stands.
+    """
     poses = [*known]
-    while True:
-        _wait_at_new_pose(robot, poses)
+    for _ in asked or repeat(None):
+        while not _stands(robot, poses if asked is None else []):
+            pass
         with suppress(MovedError):
             image, pose = sample(read, robot)
             yield image, pose
             poses.append(pose)
 
 
-def _wait_at_new_pose(robot: Robot, known: Sequence[SE3]) -> None:
+def _stands(robot: Robot, known: Sequence[SE3]) -> bool:
+    """Whether the arm stands for `STILL_S` at a pose that is not known."""
+    end = time.monotonic() + STILL_S
     pose = robot.base_from_gripper()
-    since = time.monotonic()
-    while True:
+    while time.monotonic() < end:
         time.sleep(0.02)
-        now = robot.base_from_gripper()
-        if _apart(pose, now, STILL_MM, STILL_DEG):
-            pose = now
-            since = time.monotonic()
-        is_new = all(_apart(old, pose, SAME_MM, SAME_DEG) for old in known)
-        if is_new and time.monotonic() - since >= STILL_S:
-            return
+        if _apart(pose, robot.base_from_gripper(), STILL_MM, STILL_DEG):
+            return False
+    return all(_apart(old, pose, SAME_MM, SAME_DEG) for old in known)
 
 
 def _apart(first: SE3, second: SE3, most_mm: float, most_deg: float) -> bool:

@@ -54,7 +54,10 @@ class Ros2Robot:
                     for message in topic.take():
                         self._tree.add_message(message, self._zero_ns)
                 try:
-                    base, gripper = self._named()
+                    names = self.frames
+                    base = self._tree.frame(names.base, BASES, "base_frame")
+                    gripper = self._tree.frame(names.gripper, GRIPPERS, "gripper_frame")
+                    self.frames = FrameNames(base, gripper)
                     until = self._tree.until(base, gripper)
                     before = min(before, until)
                     wanted = until if stamp_s is None else stamp_s
@@ -75,10 +78,3 @@ class Ros2Robot:
                     problem = str(error)
                 time.sleep(0.005)
         raise InputError(problem)
-
-    def _named(self) -> tuple[str, str]:
-        names = self.frames
-        base = self._tree.frame(names.base, BASES, "base_frame")
-        gripper = self._tree.frame(names.gripper, GRIPPERS, "gripper_frame")
-        self.frames = FrameNames(base, gripper)
-        return base, gripper
