@@ -1,8 +1,6 @@
 """Record with your own drivers: one that reads images, and one that states gripper poses.
 
-    python examples/10_own_driver.py [ADDRESS CAMERA.json]
-
-ADDRESS: a UR controller, by the documentation of ur_rtde, not run on an arm; else a virtual cell.
+python examples/10_own_driver.py [ADDRESS CAMERA.json]    # of a UR; default: a virtual cell
 """
 
 import sys
@@ -19,7 +17,7 @@ from evercal.recordings.cameras.camera_file import read_camera
 
 
 class UniversalRobot:
-    """An arm by RTDE, and a camera by OpenCV."""
+    """An arm by RTDE, as ur_rtde documents it (not run on an arm), and a camera by OpenCV."""
 
     def __init__(self, address: str, intrinsics: str):
         from rtde_receive import RTDEReceiveInterface  # pip install ur_rtde
@@ -36,5 +34,5 @@ class UniversalRobot:
 
 cell = UniversalRobot(*sys.argv[1:]) if sys.argv[1:] else VisitingCell()
 recorder = WristRecorder(Path("wrist"), cell.intrinsics)
-for _, (image, pose) in zip(range(25), samples(cell.read, cell), strict=False):
-    recorder.add(image, pose)
+for _, taken in zip(range(25), samples(cell.read, cell), strict=False):
+    recorder.add(*taken)

@@ -18,7 +18,10 @@ from evercal.geometry import SE3, UncertainPose
 from evercal.live.ros2.graph import Graph
 from evercal.live.ros2.publishing import POSE, PosePublisher, about_fixed_axes
 from evercal.live.sources import open_robot
+from evercal.mapping.store import MapStore
 from evercal.recordings import load_recording
+from evercal.recordings.formats.bags.file import TF
+from evercal.recordings.images import write_jpeg
 from evercal.robot.frame_names import FrameNames
 
 from .graphs import driver, environment
@@ -115,3 +118,21 @@ def test_a_late_program_receives_a_published_calibration(tmp_path):
     covariance = message.pose.covariance.reshape(6, 6)
     np.testing.assert_allclose(covariance, about_fixed_axes(uncertain))
     del publisher
+
+
+def test_tracked_poses_are_published(hall_map, hall, tmp_path):
+    store = tmp_path / "hall.evercal"
+    MapStore.create(store).commit(hall_map.scenes[0], {})
+    write_jpeg(tmp_path / "images/0000.jpg", hall.test[3].read_image(), 95)
+    graph = Graph()
+    poses = graph.subscribe("/evercal/camera/pose", POSE, True, depth=10)
+    moved = graph.subscribe("/tf", TF[0], True, depth=10)
+    words = ["track", store, tmp_path / "images", "--publish", "base", "camera"]
+    assert cli.main([*map(str, words)]) == 0
+    stated = poses.take()[0].content
+    transform = moved.take()[0].content.transforms[0]
+    assert (stated.header.frame_id, transform.child_frame_id) == ("base", "camera")
+    true = hall.test[3].base_from_camera.translation_m
+    place = stated.pose.pose.position
+    assert np.abs(np.array([place.x, place.y, place.z]) - true).max() < 0.02
+    assert stated.pose.covariance[0] > 0
