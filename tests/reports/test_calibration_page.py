@@ -219,20 +219,6 @@ def test_the_independent_check_is_named_or_what_to_do_for_one() -> None:
         assert "run 'evercal verify c.json'" in " ".join(page.text("p").split())
 
 
-def test_the_ellipsoid_is_smaller_than_the_camera_that_it_surrounds() -> None:
-    """Whatever its size, in views along the same axes."""
-    for metres in (1e-5, 3e-4, 2e-3):
-        own = full(
-            covariance=np.diag([*[metres**2, metres**2, 9 * metres**2], 0, 0, 0])
-        )
-        panels, _ = camera_views(own, Surroundings())
-        for panel, plane in zip(panels, ("xy", "xz"), strict=True):
-            assert [label[0] for label in panel.labels] == list(plane)
-            (area,) = (s.points for s in panel.shapes if s.kind == "area")
-            camera = next(s.points for s in panel.shapes if s.width == 2.2)
-            assert np.ptp(area, axis=0).max() <= np.ptp(camera, axis=0).max()
-
-
 def test_missing_contents_are_listed() -> None:
     nothing = AnnotatedImages(
         missing=("No pictures: the calibration holds no intrinsics.",)

@@ -10,16 +10,20 @@ import pytest
 from evercal.geometry import SE3, Camera, UncertainPose
 from evercal.mapping.map_frame import Similarity
 from evercal.mapping.scene_map import MapContents, SceneMap
+from evercal.reports.calibration_page import camera_views
 from evercal.reports.overlay import resized
 from evercal.reports.scene import (
     DRAWN_M,
     Ellipsoid,
     Frustum,
     Landmarks3D,
+    Surroundings,
     keyframe_views,
     readable_scale,
     surface,
 )
+
+from .test_calibration_page import full
 
 SIMILARITY = Similarity(SE3.exp([0.3, -0.2, 0.5, 0.4, -0.8, 0.2]), 2.5)
 
@@ -159,3 +163,17 @@ def test_the_scale_is_round_and_draws_at_most_five_centimetres(
 def test_resizing_keeps_the_aspect_ratio() -> None:
     assert resized(np.zeros((48, 64, 3), np.uint8), 640).shape == (480, 640, 3)
     assert resized(np.zeros((480, 640, 3), np.uint8), 160).shape == (120, 160, 3)
+
+
+def test_the_ellipsoid_is_smaller_than_the_camera_that_it_surrounds() -> None:
+    """Whatever its size, in views along the same axes."""
+    for metres in (1e-5, 3e-4, 2e-3):
+        own = full(
+            covariance=np.diag([*[metres**2, metres**2, 9 * metres**2], 0, 0, 0])
+        )
+        panels, _ = camera_views(own, Surroundings())
+        for panel, plane in zip(panels, ("xy", "xz"), strict=True):
+            assert [label[0] for label in panel.labels] == list(plane)
+            (area,) = (s.points for s in panel.shapes if s.kind == "area")
+            camera = next(s.points for s in panel.shapes if s.width == 2.2)
+            assert np.ptp(area, axis=0).max() <= np.ptp(camera, axis=0).max()
