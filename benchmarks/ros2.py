@@ -16,12 +16,13 @@ from rosbags.typesys import Stores, get_typestore
 
 from benchmarks.rows import Row, save
 from evercal import Map, cli, load_recording
-from evercal.geometry import SE3, pose_distance, pose_distance_mm_deg
+from evercal.geometry import pose_distance, pose_distance_mm_deg
 from evercal.live.ros2.graph import Graph, make
 from evercal.live.ros2.publishing import PosePublisher
 from evercal.live.sources import open_camera, open_robot
 from evercal.recordings import Recording
 from evercal.recordings.formats.bags.file import CAMERA_INFO, COMPRESSED, IMAGE, TF
+from evercal.recordings.frame import stated_grippers
 from evercal.robot.frame_names import FrameNames
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "ros2_cell.py"
@@ -94,17 +95,16 @@ def _write_bag(path: Path, done: threading.Event) -> None:
 
 def _in_bag(live: Recording, bag: Recording) -> tuple[Recording, float, float]:
     """The frames of the bag that were taken where the live ones were, and differences."""
-    poses = SE3.stack([frame.base_from_gripper for frame in bag.train])
+    poses = stated_grippers(bag.train)
     frames = []
     worst = 0.0
     pixels = []
-    for frame in live.train:
-        metres, _ = pose_distance(frame.base_from_gripper, poses)
+    for frame, pose in zip(live.train, stated_grippers(live.train), strict=True):
+        metres, _ = pose_distance(pose, poses)
         here = np.flatnonzero(metres < metres.min() + 1e-7)
-        own = bag.train[int(here[len(here) // 2])]
-        millimetres, _ = pose_distance_mm_deg(
-            own.base_from_gripper, frame.base_from_gripper
-        )
+        number = int(here[len(here) // 2])
+        own = bag.train[number]
+        millimetres, _ = pose_distance_mm_deg(poses[number], pose)
         worst = max(worst, float(millimetres))
         difference = own.read_image().astype(float) - frame.read_image()
         pixels.append(np.abs(difference).mean())

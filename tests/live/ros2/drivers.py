@@ -6,6 +6,9 @@
 Each line on stdin is a number: an arm stands at that angle, a camera shows that grey.
 """
 
+# pyright: reportArgumentType=false
+# Cyclone's classes take lists and bytes for their sequences.
+
 import math
 import sys
 import threading

@@ -46,3 +46,10 @@ def driver(*words: object) -> Iterator[subprocess.Popen[str]]:
             yield process
         finally:
             process.kill()
+
+
+def tell(process: subprocess.Popen[str], value: float) -> None:
+    """Give a driver another number."""
+    assert process.stdin is not None
+    process.stdin.write(f"{value}\n")
+    process.stdin.flush()

@@ -10,10 +10,11 @@ pytest.importorskip("rosbags")
 
 from evercal.errors import InputError
 from evercal.live.robot import TimedRobot
+from evercal.live.ros2.robot import Ros2Robot
 from evercal.live.sources import open_camera, open_robot
 from evercal.robot.frame_names import FrameNames
 
-from .graphs import driver, environment
+from .graphs import driver, environment, tell
 
 RAW = "ros2:/camera/image_raw"
 
@@ -34,8 +35,7 @@ def test_images_of_every_kind_with_their_intrinsics(kind, reliability):
     with driver("camera", kind, reliability, "320x240") as process:
         source = RAW if kind == "raw" else f"{RAW}/compressed"
         camera = open_camera(source)
-        process.stdin.write("90\n")
-        process.stdin.flush()
+        tell(process, 90)
         time.sleep(0.3)
         stamp, image = camera.read()
         assert abs(time.time() - stamp) < 2
@@ -43,6 +43,7 @@ def test_images_of_every_kind_with_their_intrinsics(kind, reliability):
         np.testing.assert_allclose(image[0, 0], (200, 100, 50), atol=3)
         np.testing.assert_allclose(image[-1, -1], 90, atol=3)
         own = camera.intrinsics()
+        assert own is not None
         assert (own.fx, own.cx, own.width) == (320, 160, 320)
         assert own.distortion[:2] == (0.1, -0.2)
         assert camera.frame_id == "wrist_optical"
@@ -67,12 +68,12 @@ def test_the_gripper_is_where_tf_has_it_now_and_at_a_time(monkeypatch):
         robot = open_robot("ros2:")
         pose = robot.base_from_gripper()
         np.testing.assert_allclose(pose.translation_m, (0.5, 0, 0.6))
-        process.stdin.write("0.4\n")
-        process.stdin.flush()
+        tell(process, 0.4)
         time.sleep(0.2)
         moved = robot.base_from_gripper()
         np.testing.assert_allclose(moved.translation_m, (0.5, 0.4, 0.6))
         np.testing.assert_allclose(moved.rotation.as_rotvec(), (0, 0, 0.4))
+        assert isinstance(robot, Ros2Robot)
         assert robot.frames == FrameNames("base_link", "tool0")
         assert isinstance(robot, TimedRobot)
         before = robot.at(time.time())

@@ -24,7 +24,7 @@ from evercal.recordings.formats.bags.file import TF
 from evercal.recordings.images import write_jpeg
 from evercal.robot.frame_names import FrameNames
 
-from .graphs import driver, environment
+from .graphs import driver, environment, tell
 
 RAW = "ros2:/camera/image_raw"
 
@@ -33,11 +33,6 @@ RAW = "ros2:/camera/image_raw"
 def on_loopback(monkeypatch):
     for name, value in environment().items():
         monkeypatch.setenv(name, value)
-
-
-def tell(process, value):
-    process.stdin.write(f"{value}\n")
-    process.stdin.flush()
 
 
 def test_a_sample_wherever_the_arm_stands_anew(tmp_path):
@@ -64,6 +59,7 @@ def test_a_sample_wherever_the_arm_stands_anew(tmp_path):
     assert len(recording.train) == 3
     assert recording.train[0].camera.fx == 64
     for number, frame in enumerate(recording.train):
+        assert frame.base_from_gripper is not None
         turn = frame.base_from_gripper.rotation.as_rotvec()
         np.testing.assert_allclose(turn, (0, 0, 0.3 * number), atol=1e-7)
         assert abs(int(frame.read_image()[-1, -1, 0]) - 60 * number) < 3
@@ -136,3 +132,17 @@ def test_tracked_poses_are_published(hall_map, hall, tmp_path):
     place = stated.pose.pose.position
     assert np.abs(np.array([place.x, place.y, place.z]) - true).max() < 0.02
     assert stated.pose.covariance[0] > 0
+
+
+def test_the_studio_samples_a_topic_at_a_pose_of_tf(tmp_path):
+    from evercal.cli.studio import Studio
+    from evercal.service.studio.devices import Connection
+
+    with driver("arm"), driver("camera", "raw", "reliable", "64x48"):
+        words = ["--camera", RAW, "--poses", "ros2:", "--out", str(tmp_path / "out")]
+        devices = cli.parsed(["studio", *words])._real()
+        assert isinstance(cli.parsed(["studio", *words]), Studio)
+        assert devices.intrinsics.fx == 64
+        image, pose = Connection(devices).sample()
+        assert image.shape == (48, 64, 3)
+        np.testing.assert_allclose(pose.translation_m, (0.5, 0, 0.6), atol=1e-9)

@@ -179,7 +179,10 @@ def _wire(kind: str) -> Any:
         def __init__(self, data: bytes):
             self.data = data
 
-        deserialize = classmethod(lambda cls, data: cls(data))
+        @classmethod
+        def deserialize(cls, data: bytes) -> Any:
+            return cls(data)
+
         deserialize_key = deserialize
 
         def serialize(self, **_: Any) -> bytes:
