@@ -21,6 +21,7 @@ from evercal.reports.scene import Frustum, KeyframeView
 from evercal.service.viewer import drawing
 from evercal.service.viewer.drawing import GRIPPER, add_arm, add_calibrations
 from evercal.service.viewer.html import chip_html, rows_html
+from evercal.service.viewer.overview import FOV_RAD, overview
 from evercal.service.viewer.page import Page, backdrop, start_server
 
 from .browsing import seen_until, shot, visited
@@ -226,6 +227,16 @@ def test_the_first_picture_holds_base_arm_and_calibrations_beside_the_panel(
             x, y = pixels_of(camera, seen, picture_px).T
             assert ((x > 0) & (x < picture_px[0])).all()
             assert ((y > 0) & (y < free_px)).all()
+
+
+def test_cameras_that_look_straight_down_have_an_overview():
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0.5]])
+    camera = MagicMock(fov=FOV_RAD)
+    found = overview(points, np.array([0.0, 0.0, -1.0]), (800, 800))
+    camera.position, camera.look_at = found
+    pixels = pixels_of(camera, points, (800, 800))
+    assert ((pixels > 0) & (pixels < 800)).all()
+    assert np.ptp(pixels, axis=0).max() > 700  # nor is it farther away than it must be
 
 
 def pixels_of(

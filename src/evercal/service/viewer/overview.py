@@ -10,8 +10,10 @@ _PHONE_PX = 576
 """Width up to which viser lays the panel over the lower part of the picture."""
 _COVERED = 1.2
 """Height that the panel covers of a phone's picture, in halves of that height."""
-_DOWN_RAD = np.deg2rad(32.0)
-"""Angle by which the visitor looks down."""
+_WIDEST = 1.1
+"""Width of the used part of a picture by its height: the panel may come over the rest."""
+_DOWN = 0.62
+"""Slope by which the visitor looks down."""
 _MARGIN = 0.92
 """Share of the picture that is used."""
 
@@ -24,14 +26,14 @@ def overview(
     The visitor looks to `ahead` (3,), whose height does not count.
     """
     width, height = np.maximum(size_px, 1)  # a hidden window may have none
-    x, y = ahead[:2] / (np.hypot(*ahead[:2]) + 1e-12)
+    level = ahead[:2] + np.array([1e-9, 0.0])  # to x from straight above
+    x, y = level / np.hypot(*level)
+    forward = np.array([x, y, -_DOWN]) / np.hypot(1, _DOWN)
     right = np.array([y, -x, 0.0])
-    level = np.cos(_DOWN_RAD)
-    forward = np.array([level * x, level * y, -np.sin(_DOWN_RAD)])
     axes = np.stack([right, np.cross(forward, right), forward])
     local = points_m @ axes.T
     depths = local[:, 2:]
-    slopes = np.tan(FOV_RAD / 2) * np.array([width / height, 1.0])
+    slopes = np.tan(FOV_RAD / 2) * np.array([min(width / height, _WIDEST), 1.0])
     low = _MARGIN * slopes
     high = low.copy()
     if width <= _PHONE_PX:

@@ -39,8 +39,6 @@ _THROUGH = "/through"
 """Node of the image behind the landmarks of a keyframe."""
 _PANEL_PX = 384
 """Width of the panel."""
-_NEAREST = 92
-"""Landmarks in the overview, percent; the others are far away, such as behind a window."""
 
 
 class Page:
@@ -78,7 +76,7 @@ class Page:
                 self._outlines.append(view.corners(size_m))
             self._add_controls(given)
             # An initial camera could replace the view that fits a visitor's window.
-            server.on_client_connect(self._begin)
+            server.on_client_connect(self.look_from_above)
         except BaseException:
             self.close()
             raise
@@ -120,20 +118,10 @@ class Page:
             client.camera.fov = view.frustum.fov_rad
         self.map.show_keyframes(False)  # they stand before the landmarks
 
-    def _begin(self, client: viser.ClientHandle) -> None:
-        """Show the overview beside the panel, which has no place yet in a wide window."""
-        width = client.camera.image_width
-        if width > 2 * _PANEL_PX:
-            width -= _PANEL_PX
-        self.look_from_above(client, width)
-
-    def look_from_above(
-        self, client: viser.ClientHandle, width_px: int | None = None
-    ) -> None:
-        """Bring a visitor back to the first view."""
+    def look_from_above(self, client: viser.ClientHandle) -> None:
+        """Show a visitor the overview."""
         camera = client.camera
-        width = width_px or camera.image_width
-        position, target = self._overview((width, camera.image_height))
+        position, target = self._overview((camera.image_width, camera.image_height))
         with client.atomic():
             client.scene.remove_by_name(_THROUGH)
             camera.up_direction = (0.0, 0.0, 1.0)
@@ -147,7 +135,7 @@ class Page:
         scene = chosen(self._scene)
         points = self.map.landmarks[scene].points_m
         apart = norms(points - np.median(points, axis=0))
-        near = points[apart <= np.percentile(apart, _NEAREST)]
+        near = points[apart <= self.map.extent_m]  # nine of ten, or so
         points = np.concatenate([near, *self._outlines])
         keyframes = self.map.keyframes[scene]
         poses = SE3.stack([view.frustum.base_from_camera for view in keyframes])
