@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
@@ -26,7 +27,7 @@ SECONDS = 5.0
 """Time that images are received."""
 SIZE = (720, 1280)
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
-_TYPES = _STORE.types
+_TYPES: dict[str, Any] = dict(_STORE.types)
 
 
 def run(domain: int = 77) -> None:
@@ -59,7 +60,7 @@ class Peer:
 
     @contextmanager
     def publishing(
-        self, topic: str, kind: str, message: object, *words: str
+        self, topic: str, kind: str, message: Any, *words: str
     ) -> Iterator[None]:
         """Publish a message again and again, a latched one once."""
         file = self._folder / "sent.cdr"
@@ -68,7 +69,7 @@ class Peer:
             yield
             process.terminate()
 
-    def received(self, topic: str, kind: str, *words: str) -> object:
+    def received(self, topic: str, kind: str, *words: str) -> Any:
         """The last message of a topic within a few seconds; None without any."""
         file = self._folder / "received.cdr"
         file.unlink(missing_ok=True)
@@ -134,6 +135,6 @@ def _published(peer: Peer) -> Iterator[Row]:
         yield {"what": f"{topic} of evercal", "arrived": "yes" if arrived else "-"}
 
 
-def _header() -> object:
+def _header() -> Any:
     stamp = _TYPES["builtin_interfaces/msg/Time"](5, 0)
     return _TYPES["std_msgs/msg/Header"](stamp, "camera")

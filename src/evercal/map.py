@@ -7,6 +7,7 @@ what they need, so that a robot that only locates images loads no module that ca
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -106,7 +107,7 @@ class Map(LearnedScenes):
         self, image: np.ndarray | PathLike, camera: Camera | None = None
     ) -> PoseEstimate:
         """Estimate the camera pose of one image or image file, see `Localizer.localize`."""
-        if isinstance(image, str | Path):
+        if isinstance(image, str | os.PathLike):
             image = read_image(image)
         return self.localizer.localize(image, camera)
 

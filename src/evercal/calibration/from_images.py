@@ -194,7 +194,7 @@ def _names(given: Images, scene: "SceneMap", held: bool) -> FrameNames:
     """The camera is that of the images, and not the one that recorded the scene."""
     role = "gripper" if held else "base"
     own = FrameNames(**{role: vars(scene.frames)[role]})
-    names = own.told(given.frames, f"scene {scene.name}")
+    names = own.completed_by(given.frames, f"scene {scene.name}")
     if given.base_from_gripper is None:
         names = replace(names.or_of(scene.frames), camera=names.camera)
     return names

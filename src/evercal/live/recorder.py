@@ -41,7 +41,8 @@ class WristRecorder:
     def __init__(self, root: Path, camera: Camera, names: FrameNames = UNKNOWN):
         self._root = Path(root)
         self._camera = camera
-        self._names = names
+        self.names = names
+        """Frames, as far as they are known when the first sample is added."""
         self._frames: list[Frame] = []
         require_own(self._root / "images")
         if wrist.detect(self._root):
@@ -50,7 +51,7 @@ class WristRecorder:
                     f"{root}: holds gripper poses, but no {POSES}; use a new folder"
                 )
             begun = wrist.load(self._root, ReadOptions())
-            self._names = names.told(begun.frames, root)
+            self.names = names.completed_by(begun.frames, root)
             self._frames = list(begun.train)
             if any(frame.camera != camera for frame in self._frames):
                 raise InputError(
@@ -72,8 +73,8 @@ class WristRecorder:
         if not self._frames:
             (self._root / "images").mkdir(parents=True, exist_ok=True)
             write_json(self._root / "camera.json", asdict(self._camera))
-            if self._names != UNKNOWN:
-                write_json(self._root / wrist.NAMES, asdict(self._names))
+            if self.names != UNKNOWN:
+                write_json(self._root / wrist.NAMES, asdict(self.names))
         images = self._root / "images"
         path = images / next_name(images)
         write_jpeg(path, image, JPEG_QUALITY)

@@ -111,8 +111,8 @@ def load_recording(
         folder = root if root.is_dir() else root.parent
         recording = with_images(recording, folder)
     names = [getattr(options, o) or "" if o not in uses else "" for o in FRAMES]
-    told = recording.frames.told(FrameNames(*names), root)
-    recording = replace(recording, frames=told)
+    frames = recording.frames.completed_by(FrameNames(*names), root)
+    recording = replace(recording, frames=frames)
     if (root / "masks").is_dir():
         from evercal.recordings.masks import with_masks
 

@@ -35,7 +35,7 @@ class FrameNames:
             self.camera or other.camera,
         )
 
-    def told(self, names: "FrameNames", source: object) -> "FrameNames":
+    def completed_by(self, names: "FrameNames", source: object) -> "FrameNames":
         """These names of a source, and those given for its unknown frames; others are refused."""
         for role, name in vars(names).items():
             own = vars(self)[role] or name

@@ -1,6 +1,8 @@
 """`record`, `track --publish` and `export --publish` in graphs of several processes."""
 
 import io
+import signal
+import subprocess
 import sys
 import threading
 import time
@@ -14,6 +16,7 @@ pytest.importorskip("rosbags")
 from scipy.spatial.transform import Rotation
 
 from evercal import cli
+from evercal.calibration.calibration import Calibration
 from evercal.geometry import SE3, UncertainPose
 from evercal.live.ros2.graph import Graph
 from evercal.live.ros2.publishing import POSE, PosePublisher, about_fixed_axes
@@ -143,6 +146,27 @@ def test_the_studio_samples_a_topic_at_a_pose_of_tf(tmp_path):
         devices = cli.parsed(["studio", *words])._real()
         assert isinstance(cli.parsed(["studio", *words]), Studio)
         assert devices.intrinsics.fx == 64
-        image, pose = Connection(devices).sample()
+        connection = Connection(devices)
+        image, pose = connection.sample()
+        names = FrameNames("base_link", "tool0", "wrist_optical")
+        assert connection.frames("wrist") == names
         assert image.shape == (48, 64, 3)
         np.testing.assert_allclose(pose.translation_m, (0.5, 0, 0.6), atol=1e-9)
+
+
+def test_a_calibration_is_published_until_the_command_ends(tmp_path):
+    pose = UncertainPose(SE3.exp([0.5, -0.2, 0.8, 0.3, 2.0, -0.4]), 1e-6 * np.eye(6))
+    names = FrameNames("base_link", "", "tripod_optical")
+    file = tmp_path / "tripod.json"
+    Calibration("eye_to_hand", pose.pose, pose.covariance, frames=names).write(file)
+    command = [sys.executable, "-m", "evercal", "export", str(file), "--publish"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert "published on /tf_static" in process.stdout.readline()
+        robot = open_robot("ros2:", FrameNames("base_link", "tripod_optical"))
+        heard = robot.base_from_gripper()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0
+    np.testing.assert_allclose(heard.matrix(), pose.pose.matrix(), atol=1e-12)

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 from evercal.classes import frozen_arrays
@@ -10,6 +11,7 @@ from evercal.geometry import SE3, Camera
 from evercal.live.camera import LiveCamera
 from evercal.live.robot import Robot
 from evercal.live.sampling import sample
+from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.typing import Array, Image
 
 Which = Literal["wrist", "fixed"]
@@ -86,6 +88,12 @@ class Connection:
             self.image(which)
         except (InputError, OSError) as error:
             self.problems[which] = str(error)
+
+    def frames(self, which: Which) -> FrameNames:
+        """Names of frames, as far as the robot and the images of a camera state them."""
+        names = getattr(self.devices.robot, "frames", UNKNOWN)
+        camera = getattr(self.devices.cameras[which], "frame_id", "")
+        return replace(names, camera=camera)
 
     def image(self, which: Which) -> Image:
         """Read an image."""

@@ -175,7 +175,10 @@ class Studio:
 
     def take_sample(self, which: Which = "wrist") -> str:
         """Record image and pose."""
-        name = self.recorders[which].add(*self.connection.sample(which)).name
+        recorder = self.recorders[which]
+        taken = self.connection.sample(which)
+        recorder.names = recorder.names.or_of(self.connection.frames(which))
+        name = recorder.add(*taken).name
         bad = "; ".join(self.coverage(which).samples[-1].problems)
         if bad:
             return f"Took sample {name}, {bad}: better remove it."
