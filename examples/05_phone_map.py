@@ -16,7 +16,8 @@ from evercal.recordings.reconstruct import reconstruct
 
 def main(video: Path, images: Path, poses: Path) -> None:
     """Map what the video shows, in the base frame, and calibrate a camera in it."""
-    print(reconstruct(video, "capture"))
+    built = reconstruct(video, "capture")
+    print(f"{built.posed} of {built.frames} frames have a pose")
     room = evercal.Map.open("phone.evercal")
     room.learn("capture", name="cell", memory="30%")
     aligned = room.align("cell", images, robot_poses=poses)

@@ -2,7 +2,7 @@
 
     python examples/07_verify.py
 
-The tripod camera of the packaged cell is calibrated by the map. Five points are touched by the tool
+The tripod camera of the packaged cell is calibrated by the map. Four points are touched by the tool
 and picked in one image: here they are projected by the true pose, with half a pixel of noise.
 """
 

@@ -26,7 +26,7 @@ def main(path: Path) -> None:
             url = json.loads(next(service.stdout))["url"]
             client = evercal.Client(url)  # this could be another computer
             estimate = client.localize(CELL / "bumped.jpg")
-            print(f"{estimate.status}: {estimate.base_from_camera}")
+            print(estimate.status, estimate.base_from_camera.translation_m)
             calibration = client.calibrate(CELL / "tripod")
             print(calibration.verdict)
             shift = client.check(CELL / "bumped.jpg", calibration)

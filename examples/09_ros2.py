@@ -18,15 +18,15 @@ from evercal.live.ros2.publishing import PosePublisher
 
 
 def main(topic: str | None) -> None:
-    """Write wrist.json and publish it on /tf_static."""
+    """Write ros2.json and publish it on /tf_static."""
     with nullcontext() if topic else virtual_cell():
         source = f"ros2:{topic or '/camera/image_raw'}"
-        cli.main(["record", source, "wrist", "--most", "25"])
-    cell = evercal.Map.open("cell.evercal")
-    cell.learn("wrist")
+        cli.main(["record", source, "ros2", "--most", "25"])
+    cell = evercal.Map.open("ros2.evercal")
+    cell.learn("ros2")
     wrist = cell.calibration()
     print(f"{wrist.meaning}; {wrist.verdict}")
-    wrist.write("wrist.json")
+    wrist.write("ros2.json")
     publisher = PosePublisher(wrist.parent_frame, wrist.child_frame, static=True)
     publisher.publish(wrist.uncertain_pose, time.time())
     print(f"on {' and '.join(publisher.topics)} until this program ends")

@@ -33,6 +33,6 @@ class UniversalRobot:
 
 
 cell = UniversalRobot(*sys.argv[1:]) if sys.argv[1:] else VisitingCell()
-recorder = WristRecorder(Path("wrist"), cell.intrinsics)
+recorder = WristRecorder(Path("driver"), cell.intrinsics)
 for _, taken in zip(range(25), samples(cell.read, cell), strict=False):
-    recorder.add(*taken)
+    print(recorder.add(*taken).name)

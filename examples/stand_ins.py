@@ -38,7 +38,7 @@ def board_images(folder: Path, count: int = 20) -> None:
         plane = K @ camera_from_board.matrix()[:3, [0, 1, 3]] @ square
         image = cv2.warpPerspective(drawn, plane, (1280, 960), borderValue=[128])
         image = cv2.GaussianBlur(image, (0, 0), 0.7) + rng.normal(0, 3, image.shape)
-        cv2.imwrite(str(folder / f"{i:02}.png"), image)
+        cv2.imwrite(str(folder / f"{i:02}.png"), image.clip(0, 255).astype(np.uint8))
     (folder / "poses.csv").write_text(pose_rows(SE3.stack(grippers)))
     np.savetxt(folder / "camera.txt", K)
 

@@ -119,10 +119,10 @@ def test_ros2(tmp_path: Path) -> None:
     truth = json.loads((tmp_path / "virtual/truth.json").read_text("utf-8"))
     pose = truth["gripper_from_camera"]
     true = SE3(pose["quaternion_wxyz"], pose["translation_m"])
-    assert pose_distance_mm_deg(read_transform(tmp_path / "wrist.json"), true)[0] < 0.5
+    assert pose_distance_mm_deg(read_transform(tmp_path / "ros2.json"), true)[0] < 0.5
 
 
 @slow
 def test_own_driver(tmp_path: Path) -> None:
     example("10_own_driver.py", tmp_path)
-    assert len(load_recording(tmp_path / "wrist").train) == 25
+    assert len(load_recording(tmp_path / "driver").train) == 25

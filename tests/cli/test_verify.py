@@ -71,7 +71,7 @@ def test_the_report_shows_the_result(run, folder: Path) -> None:
     run("verify moved.json", TOUCHED)
     run("report moved.json --out r.html")
     page = Path("r.html").read_text("utf-8")
-    assert "Tests by other data" in page
+    assert "Independent check" in page
     assert "5 touched points: errors of" in page
     assert "<strong>not as stated</strong>" in page
 

@@ -116,7 +116,6 @@ def test_archives_that_are_no_complete_map_are_refused(
     with pytest.raises(InputError, match="bytes when extracted, at most 10,000"):
         unpack_map(packed, tmp_path / "copy")
     left = tree(tmp_path)
-    left.pop(".copy.lock")
     assert left == before
     assert not (tmp_path / "copy").exists()
 

@@ -199,7 +199,7 @@ def lens_lines(calibration: "Calibration") -> Iterator[str]:
         left = calibration.stated_left_rad
         yield (
             "  intrinsics   the pose is for the estimated ones; 'evercal export' turns it for the"
-            f" stated ones, which leave {math.degrees(left):.3f} deg that no pose explains,"
+            f" stated ones, with a residual of {math.degrees(left):.3f} deg,"
             f" {500 * left:.2f} mm at 0.5 m"
         )
 

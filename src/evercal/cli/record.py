@@ -83,5 +83,8 @@ class Record(args.Verb):
         covered = coverage(taken)
         record = {"recording": str(self.out), "verdict": covered.verdict}
         line = f"wrote {self.out}: {covered.verdict}"
-        self.answer(record, line, then=("learn", "MAP", self.out))
+        then = ("learn", "MAP", self.out)
+        if not covered.ready:
+            then = ("record", self.source, self.out)
+        self.answer(record, line, then=then)
         return 0 if covered.ready else 1

@@ -51,7 +51,11 @@ class WristRecorder:
                     f"{root}: holds gripper poses, but no {POSES}; use a new folder"
                 )
             begun = wrist.load(self._root, ReadOptions())
-            self.names = names.completed_by(begun.frames, root)
+            self.names = names.or_of(begun.frames)
+            if self.names != begun.frames.or_of(names):
+                raise InputError(
+                    f"{root}: was recorded with other frames; use a new folder"
+                )
             self._frames = list(begun.train)
             if any(frame.camera != camera for frame in self._frames):
                 raise InputError(

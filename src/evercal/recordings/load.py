@@ -135,6 +135,10 @@ def format_of(root: Path, stated: FormatName | None = None) -> FormatName:
         what = "a file, not a folder, and no bag"
         if root.is_dir():
             what = "no known scene format"
+            inside = [path for path in sorted(root.iterdir()) if recognised(path)]
+            if inside:
+                names = " or ".join(map(str, inside[:4]))
+                raise InputError(f"{root}: no recording, but it has some; give {names}")
         known = ", ".join(f"{entry.contents} ({key})" for key, entry in FORMATS.items())
         raise InputError(f"{root}: {what}; expected {known}")
     return format

@@ -193,8 +193,9 @@ class StageStore(Generic[Contents]):
             yield before
         finally:
             # Who waits tries again: the file that it has opened has no links any more.
-            if os.name == "posix" and self._lock.lock_counter == 1:
-                Path(self._lock.lock_file).unlink(missing_ok=True)
+            if self._lock.lock_counter == 1:
+                with suppress(PermissionError):  # of Windows, where the file is open
+                    Path(self._lock.lock_file).unlink(missing_ok=True)
             self._lock.release()
 
     def add(

@@ -113,17 +113,15 @@ def test_another_domain_and_another_type(monkeypatch):
     monkeypatch.setattr("evercal.live.ros2.graph.FIND_S", 0.5)
     with driver("camera", "raw", "best_effort", "64x48"):
         assert open_camera(RAW).read()[1].shape == (48, 64, 3)
-        with pytest.raises(InputError, match="it is on /camera/image_raw"):
+        with pytest.raises(InputError, match="but on /camera/image_raw"):
             open_camera("ros2:/camera/camera_info")
         in_new_domain(monkeypatch)
-        with pytest.raises(InputError, match=r"nobody publishes sensor_msgs/msg/Image"):
+        with pytest.raises(InputError, match=r"no sensor_msgs/msg/Image"):
             open_camera(RAW)
 
 
 @pytest.mark.parametrize("domain", ["300", "home"])
 def test_a_domain_that_is_none(monkeypatch, domain):
     monkeypatch.setenv("ROS_DOMAIN_ID", domain)
-    with pytest.raises(
-        InputError, match=f"ROS_DOMAIN_ID {domain}: .* a domain is 0 to"
-    ):
+    with pytest.raises(InputError, match=f"ROS_DOMAIN_ID {domain}: give a number"):
         open_camera(RAW)

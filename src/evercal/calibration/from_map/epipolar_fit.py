@@ -105,7 +105,7 @@ class EpipolarFit:
             # The matches of a pair share the errors of its poses, so each pair counts as one match.
             away = np.sqrt(matches) * (x - centre)[3:] / spread
             # The loss of these residuals is quadratic: the prior is no outlier.
-            size = np.sqrt(np.expm1(np.minimum(away**2, 500.0)))
+            size = np.sqrt(np.expm1(np.minimum(away**2, 300.0)))
             prior = scale * np.sign(away) * size
             return np.r_[self.distances(x), prior]
 

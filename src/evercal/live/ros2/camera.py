@@ -41,7 +41,11 @@ class Ros2Camera(StreamCamera):
         height, width = self.read()[1].shape[:2]
         images = self._images.topic
         topic = info_topic(images)
-        message = self._graph.find(topic, (CAMERA_INFO,)).next(self._timeout_s)
+        try:
+            infos = self._graph.find(topic, (CAMERA_INFO,))
+        except InputError as error:
+            raise InputError(f"{error}, or give the intrinsics") from None
+        message = infos.next(self._timeout_s)
         if message is None:
             raise InputError(f"ros2:{topic}: nothing arrives; give the intrinsics")
         size = (width, height)

@@ -6,6 +6,7 @@ as those of bags, which takes milliseconds for an image where Cyclone's own clas
 a second.
 """
 
+import math
 import os
 import threading
 import time
@@ -35,6 +36,10 @@ from evercal.recordings.formats.bags.file import Message
 
 FIND_S = 5.0
 """Time that a publisher has to appear on the graph, seconds."""
+_DOMAINS = 233
+"""Domains of DDS with its usual ports."""
+_WAIT_NS = 10**8
+"""Time that Cyclone waits at once, nanoseconds."""
 _ALIVE = ViewState.Any | SampleState.Any | InstanceState.Alive
 _MANY = 10_000
 """More than arrive at once."""
@@ -50,12 +55,15 @@ class Graph:
 
     def __init__(self) -> None:
         domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+        if domain not in map(str, range(_DOMAINS)):
+            raise InputError(
+                f"ROS_DOMAIN_ID {domain}: give a number from 0 to {_DOMAINS - 1}"
+            )
         try:
             self._participant = DomainParticipant(int(domain))
-        except (ValueError, DDSException) as error:
+        except DDSException as error:
             raise InputError(
-                f"ROS_DOMAIN_ID {domain}: no ROS 2 graph can be joined ({error}); a domain is 0 to"
-                " 232; check the network and CYCLONEDDS_URI"
+                f"no ROS 2 graph can be joined ({error}); check the network and CYCLONEDDS_URI"
             ) from None
         self._writers = BuiltinDataReader(
             self._participant, BuiltinTopicDcpsPublication
@@ -82,8 +90,8 @@ class Graph:
             time.sleep(0.02)
         there = sorted({one.topic_name[2:] for one in writers}) or ["no topic"]
         raise InputError(
-            f"ros2:{topic}: nobody publishes {' or '.join(kinds)}; it is on {', '.join(there)}."
-            " Check the driver and ROS_DOMAIN_ID"
+            f"ros2:{topic}: no {' or '.join(kinds)} is published there, but on {', '.join(there)};"
+            " check the topic, the driver and ROS_DOMAIN_ID"
         )
 
     def subscribe(
@@ -134,10 +142,11 @@ class Subscription:
     def next(self, timeout_s: float | None = None) -> Message | None:
         """The first that arrives from now on; None after a time without one."""
         self._reader.take(_MANY)
-        for sample in self._reader.take_iter(
-            timeout=timeout_s and int(timeout_s * 1e9)
-        ):
-            return self._decoded(sample)
+        end = math.inf if timeout_s is None else time.monotonic() + timeout_s
+        while time.monotonic() < end:
+            # Signals such as Ctrl-C wait as long as Cyclone does.
+            for sample in self._reader.take_iter(timeout=_WAIT_NS):
+                return self._decoded(sample)
         return None
 
     def _decoded(self, sample: Any) -> Message:
