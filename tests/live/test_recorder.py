@@ -8,6 +8,7 @@ from evercal.geometry import SE3, Camera, pose_distance
 from evercal.live.recorder import WristRecorder
 from evercal.recordings import load_recording
 from evercal.recordings.frame import stated_grippers
+from evercal.robot.frame_names import FrameNames
 
 CAMERA = Camera(32, 24, 30.0, 30.0, 15.5, 11.5)
 
@@ -80,3 +81,14 @@ def test_images_that_lie_elsewhere_are_refused(tmp_path):
     (tmp_path / "b" / "images").symlink_to(tmp_path / "a" / "images")
     with pytest.raises(InputError, match=r"images: is a link; use a new folder"):
         WristRecorder(tmp_path / "b", CAMERA)
+
+
+def test_a_recording_of_other_frames_is_refused(tmp_path):
+    names = FrameNames("base_link", "tool0", "wrist_optical")
+    image = np.zeros((24, 32, 3), np.uint8)
+    WristRecorder(tmp_path / "wrist", CAMERA, names).add(image, SE3.identity())
+    assert WristRecorder(tmp_path / "wrist", CAMERA).names == names
+    with pytest.raises(InputError, match="was recorded with other frames"):
+        WristRecorder(tmp_path / "wrist", CAMERA, FrameNames(camera="tripod"))
+    with pytest.raises(InputError, match=r"it has some; give .*wrist"):
+        load_recording(tmp_path)
