@@ -53,6 +53,9 @@ def test_help_lists_every_verb_once_in_its_group():
     assert seconds < 5  # one second where nothing else runs
 
 
+INDENT = "│" + 15 * " "
+
+
 @pytest.mark.parametrize("verb", ALL)
 def test_help_of_a_verb_fits_and_has_an_example(run, verb, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
@@ -60,6 +63,10 @@ def test_help_of_a_verb_fits_and_has_an_example(run, verb, monkeypatch):
     assert (ran.code, ran.err) == (0, [])
     assert re.search(rf"^Example: evercal {verb} ", ran.out, re.MULTILINE)
     assert max(map(len, ran.out.splitlines())) <= 80
+    for line, after in itertools.pairwise(ran.out.splitlines()):
+        if line.startswith(INDENT) and after.startswith(INDENT):
+            words = after.strip("│ ").split()
+            assert len(line.rstrip("│ ")) + len(words[0]) >= 77, line
     assert "(default: None)" not in ran.out
     assert "(default: )" not in ran.out
     assert "--no-" not in ran.out

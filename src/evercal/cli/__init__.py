@@ -15,7 +15,7 @@ import shutil
 import sys
 import tempfile
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from evercal.errors import InputError, printable
@@ -49,6 +49,8 @@ VERBS = {
 }
 """Verbs by purpose, in the order of the help. The class `Learn` of `learn` is in `learn.py`."""
 
+_INDENT = "│" + 15 * " "
+"""Before the text of an option in a help page."""
 _BROKEN_PIPE = 141
 """Status of a program whose reader has ended: 128 and the number of SIGPIPE."""
 _X86 = ("x86_64", "AMD64")
@@ -205,8 +207,30 @@ def parsed(words: list[str], as_json: bool = False) -> Any:
 def _print_wrapped(page: str) -> None:
     """Print a help page; tyro leaves lines longer than the terminal is wide."""
     columns = shutil.get_terminal_size().columns
-    for line in page.splitlines():
+    for line in _rejoined(page.splitlines()):
         print("\n".join(textwrap.wrap(line, columns, break_on_hyphens=False)))
+
+
+def _rejoined(lines: Sequence[str]) -> Iterator[str]:
+    """Lines of a help page; tyro breaks the text of an option where its source does."""
+    head = ""
+    texts: list[str] = []
+    for line in [*lines, ""]:
+        if texts and line.startswith(_INDENT):
+            texts.append(line[len(_INDENT) : -1].strip())
+            continue
+        if texts:
+            width = len(lines[-1]) - len(_INDENT) - 2
+            for text in textwrap.wrap(" ".join(texts), width, break_on_hyphens=False):
+                yield f"{head}{text:{width}} │"
+                head = _INDENT
+        head = line[: len(_INDENT)]
+        texts = []
+        # A long name stands in a line of its own.
+        if head.startswith("│") and head.endswith("  "):
+            texts.append(line[len(_INDENT) : -1].strip())
+        else:
+            yield line
 
 
 def _box_text(box: str) -> str:
