@@ -10,6 +10,7 @@ pytest.importorskip("rosbags")
 
 from evercal.errors import InputError
 from evercal.live.robot import TimedRobot
+from evercal.live.ros2 import robot as ros2_robot
 from evercal.live.ros2.robot import Ros2Robot
 from evercal.live.sources import open_camera, open_robot
 from evercal.robot.frame_names import FrameNames
@@ -104,7 +105,7 @@ def test_a_camera_or_an_arm_that_is_gone(monkeypatch):
         robot = open_robot("ros2:")
         robot.base_from_gripper()
     with pytest.raises(
-        InputError, match="no pose of tool0 in base_link at the time asked for"
+        InputError, match="no pose of tool0 in base_link arrives any more"
     ):
         robot.base_from_gripper()
 
@@ -125,3 +126,10 @@ def test_a_domain_that_is_none(monkeypatch, domain):
     monkeypatch.setenv("ROS_DOMAIN_ID", domain)
     with pytest.raises(InputError, match=f"ROS_DOMAIN_ID {domain}: give a number"):
         open_camera(RAW)
+
+
+def test_a_graph_without_an_arm(monkeypatch):
+    in_new_domain(monkeypatch)
+    monkeypatch.setattr(ros2_robot, "FIND_S", 0.3)
+    with pytest.raises(InputError, match="ros2:/tf: nothing arrives"):
+        Ros2Robot().base_from_gripper()

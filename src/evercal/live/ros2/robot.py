@@ -69,12 +69,18 @@ class Ros2Robot:
                         stamp_s is not None or until > before or before == np.inf
                     ):
                         return poses[0]
-                    problem = (
-                        f"ros2:/tf: no pose of {gripper} in {base} at the time asked for,"
-                        f" {until - wanted:.2f} s before the last one; check its publisher, and"
-                        " whether the clocks are the same"
-                    )
+                    what = f"ros2:/tf: no pose of {gripper} in {base}"
+                    problem = f"{what} arrives any more; check its publisher"
+                    if stamp_s is not None:
+                        problem = (
+                            f"{what} at the time of the image, {until - wanted:.2f} s before the"
+                            " last one; are the clocks the same?"
+                        )
                 except InputError as error:  # the tree grows
                     problem = str(error)
                 time.sleep(0.005)
+        if not self._tree.frames():
+            problem = (
+                "ros2:/tf: nothing arrives; check the robot's driver and ROS_DOMAIN_ID"
+            )
         raise InputError(problem)
