@@ -39,19 +39,15 @@ class Step:
     """A part of a page."""
 
     kind: str
-    """`text`, `command`, `python`, or the name of the file that a block is saved as."""
+    """`command`, `python`, or the name of the file that a block is saved as."""
     text: str
     code: int = 0
     """Expected exit code of a command."""
 
 
 def parts(page: str) -> Iterator[Step]:
-    """Text, commands and blocks of Python of a page, in its order."""
-    end = 0
+    """Commands and blocks of Python of a page, in its order."""
     for block in _BLOCK.finditer(page):
-        if text := page[end : block.start()].strip():
-            yield Step("text", text)
-        end = block.end()
         name, code, command = block.groups()
         if command is None:
             yield Step(name or "python", code)
@@ -59,8 +55,6 @@ def parts(page: str) -> Iterator[Step]:
         line, _, comment = command.partition("  # ")
         stated = re.match(r"\s*exit code (\d+)", comment)
         yield Step("command", line.strip(), int(stated[1]) if stated else 0)
-    if text := page[end:].strip():
-        yield Step("text", text)
 
 
 def text_of(name: str) -> str:
@@ -107,8 +101,6 @@ def run(page: str, folder: Path, cell: Path | None = None) -> str:
         around.enter_context(contextlib.chdir(folder))
         around.enter_context(contextlib.redirect_stdout(printed))
         for step in parts(page):
-            if step.kind == "text":
-                continue
             if step.kind not in ("command", "python"):
                 (folder / step.kind).write_text(step.text, encoding="utf-8")
             elif step.text.endswith("&"):
@@ -196,7 +188,7 @@ def test_a_method_of_your_own(tmp_path: Path) -> None:
 def test_steps_are_read_in_order() -> None:
     page = "Text.\n\n    evercal check a b    # exit code 1: moved\n\n```python\nx = 1\n```\n"
     page += "```python my.py\ny = 2\n```\n    evercal serve a &\n"
-    assert [part for part in parts(page) if part.kind != "text"] == [
+    assert list(parts(page)) == [
         Step("command", "evercal check a b", 1),
         Step("python", "x = 1\n"),
         Step("my.py", "y = 2\n"),
