@@ -98,11 +98,14 @@ class Coverage:
 
 
 def coverage(
-    samples: Sequence[Sample], gripper_from_camera: SE3 | None = None
+    samples: Sequence[Sample],
+    gripper_from_camera: SE3 | None = None,
+    use: str = "learned",
 ) -> Coverage:
     """Report what samples cover, in recorded order; those with problems count as not recorded.
 
-    With a rough `gripper_from_camera`, axes are those of the camera.
+    With a rough `gripper_from_camera`, axes are those of the camera. `use` says what can be done
+    with the recording.
     """
     poses = SE3.stack([sample.base_from_gripper for sample in samples])
     rows = _sample_reports(samples, poses)
@@ -121,7 +124,7 @@ def coverage(
     rank = int((principal_spreads >= ROTATION_DEG).sum())
     ready = len(good) >= MIN_GRIPPER_FRAMES and rank >= 2
     missing = _missing(len(good), rank, rotations, positions)
-    state = "can be learned" if ready else "cannot be learned yet"
+    state = f"can be {use}" if ready else f"cannot be {use} yet"
     verdict = f"{len(good)} of {len(rows)} images are good; the recording {state}."
     if missing:
         verdict += f" Missing: {'; '.join(missing[:3])}."

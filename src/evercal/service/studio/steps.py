@@ -77,7 +77,7 @@ def _hold(studio: Studio) -> State:
     if studio.connection.devices.fixed_camera is None:
         return "waits", _NO_FIXED
     if covered.samples:
-        return "to do", covered.verdict.replace("be learned", "be calibrated")
+        return "to do", covered.verdict
     return "to do", (
         "Calibrates the fixed camera without a scene. The gripper holds a textured thing, such as a"
         f" box or a book, and turns it by 20° and more about two axes: {MIN_GRIPPER_FRAMES} images"

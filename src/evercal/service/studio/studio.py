@@ -129,7 +129,7 @@ class Studio:
         samples = list(map(_measured, self.recorders[which].frames))
         if which == "wrist":
             return coverage(samples, self.mount)
-        return coverage(samples)
+        return coverage(samples, use="calibrated")
 
     def bad_samples(self, which: Which = "wrist") -> list[str]:
         """Names of the samples with problems."""
