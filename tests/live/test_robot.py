@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 from evercal.errors import InputError
-from evercal.geometry import SE3, pose_distance, pose_to_dict
+from evercal.geometry import SE3, Camera, pose_distance, pose_to_dict
+from evercal.live.camera import StreamCamera
 from evercal.live.robot import PoseFileRobot
+from evercal.live.sources import open_robot
+from evercal.robot.frame_names import FrameNames
+from evercal.service.studio.devices import Connection, Devices
 
 HEADER = "stamp_s,x,y,z,qw,qx,qy,qz\n"
 
@@ -81,3 +85,14 @@ def test_bad_files_are_named(tmp_path):
     os.utime(path, (ahead, ahead))
     refused(r"written 3[56]\d\d\.\d s in the future; set")
     PoseFileRobot(path).base_from_gripper()
+
+
+def test_names_that_were_given_are_kept_beside_a_file(tmp_path):
+    names = FrameNames("base_link", "tool0", "wrist_optical")
+    robot = open_robot(tmp_path / "poses.csv", names)
+    camera = StreamCamera(str(tmp_path))
+    intrinsics = Camera(32, 24, 30.0, 30.0, 15.5, 11.5)
+    devices = Devices(camera, intrinsics, robot, fixed_camera=camera)
+    connection = Connection(devices)
+    assert connection.frames("wrist") == names
+    assert connection.frames("fixed") == FrameNames("base_link", "tool0")

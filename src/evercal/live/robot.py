@@ -11,6 +11,7 @@ from typing import Protocol, runtime_checkable
 from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.poses.robot_poses import read_last_robot_pose
+from evercal.robot.frame_names import UNKNOWN, FrameNames
 
 
 @runtime_checkable
@@ -53,10 +54,13 @@ class PoseFileRobot:
         path: Path | str,
         convention: str | None = None,
         most_age_s: float | None = None,
+        frames: FrameNames = UNKNOWN,
     ):
         self._path = Path(path)
         self._convention = convention
         self._most_age_s = most_age_s
+        self.frames = frames
+        """Names of the frames, which the file does not state."""
 
     def base_from_gripper(self) -> SE3:
         """Read the pose of the last complete line; InputError without such a line."""

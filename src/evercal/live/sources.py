@@ -29,4 +29,4 @@ def open_robot(
         from evercal.live.ros2.robot import Ros2Robot
 
         return Ros2Robot(frames)
-    return PoseFileRobot(source, convention, most_age_s)
+    return PoseFileRobot(source, convention, most_age_s, frames)

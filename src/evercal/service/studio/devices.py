@@ -90,9 +90,14 @@ class Connection:
             self.problems[which] = str(error)
 
     def frames(self, which: Which) -> FrameNames:
-        """Names of frames, as far as the robot and the images of a camera state them."""
+        """Names of frames, as far as the robot and the images of a camera state them.
+
+        The name that was given with the robot's is that of the first camera.
+        """
         names = getattr(self.devices.robot, "frames", UNKNOWN)
         camera = getattr(self.devices.cameras[which], "frame_id", "")
+        if not camera and which == next(iter(self.devices.cameras)):
+            camera = names.camera
         return replace(names, camera=camera)
 
     def image(self, which: Which) -> Image:
