@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from benchmarks.rows import Row, save
 from evercal import Map, cli, load_recording
 from evercal.geometry import pose_distance, pose_distance_mm_deg
-from evercal.live.ros2.graph import Graph, make
+from evercal.live.ros2.graph import Graph, header, make
 from evercal.live.ros2.publishing import PosePublisher
 from evercal.live.sources import open_camera, open_robot
 from evercal.recordings import Recording
@@ -171,8 +171,7 @@ def _publish(compressed: bool, seconds: float, per_second: float) -> None:
     cpu = time.process_time()
     count = 0
     while time.time() < begun + seconds:
-        stamp = make("builtin_interfaces/msg/Time", *divmod(time.time_ns(), 10**9))
-        send(make(kind, make("std_msgs/msg/Header", stamp, "camera"), *words))
+        send(make(kind, header("camera", time.time()), *words))
         count += 1
         time.sleep(max(0.0, begun + count / per_second - time.time()))
     print(count / seconds, 1e3 * (time.process_time() - cpu) / count)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from evercal.geometry import SE3, UncertainPose, pose_distance
-from evercal.live.ros2.graph import Graph, make
+from evercal.live.ros2.graph import Graph, header, make
 from evercal.live.ros2.publishing import PosePublisher
 from evercal.live.sources import open_robot
 from evercal.recordings import load_recording
@@ -66,25 +66,23 @@ def camera(recording) -> None:
     show = graph.publisher("/camera/image_raw", "sensor_msgs/msg/Image", False)
     inform = graph.publisher("/camera/camera_info", "sensor_msgs/msg/CameraInfo", False)
     roi = make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
-    own = frames[0].camera
-    lens = np.array([*own.distortion, 0, 0, 0, 0, 0][:5], float)
-    k = own.matrix()
-    words = ("plumb_bob", lens, k.ravel(), np.eye(3).ravel())
+    lens = frames[0].camera
+    coefficients = np.array([*lens.distortion, 0, 0, 0, 0, 0][:5], float)
+    k = lens.matrix()
+    words = ("plumb_bob", coefficients, k.ravel(), np.eye(3).ravel())
     words += (np.eye(3, 4).ravel(), 0, 0, roi)
-    size = (own.height, own.width)
+    size = (lens.height, lens.width)
     robot = open_robot("ros2:")
     robot.base_from_gripper()
     print("ready", flush=True)
     while True:
         pose = robot.base_from_gripper()
         image = images[int(np.argmin(pose_distance(pose, poses)[0]))]
-        now = divmod(time.time_ns(), 10**9)
-        stamp = make("builtin_interfaces/msg/Time", *now)
-        header = make("std_msgs/msg/Header", stamp, "wrist_optical")
-        row = 3 * own.width
+        own = header("wrist_optical", time.time())
+        row = 3 * lens.width
         bytes_of = image.ravel()
-        show(make("sensor_msgs/msg/Image", header, *size, "rgb8", 0, row, bytes_of))
-        inform(make("sensor_msgs/msg/CameraInfo", header, *size, *words))
+        show(make("sensor_msgs/msg/Image", own, *size, "rgb8", 0, row, bytes_of))
+        inform(make("sensor_msgs/msg/CameraInfo", own, *size, *words))
         time.sleep(0.1)
 
 

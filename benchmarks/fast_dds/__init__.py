@@ -19,7 +19,7 @@ from benchmarks.rows import Row, show
 from evercal.errors import InputError
 from evercal.geometry import SE3, UncertainPose
 from evercal.live.ros2.camera import Ros2Camera
-from evercal.live.ros2.graph import Graph
+from evercal.live.ros2.graph import Graph, header, make
 from evercal.live.ros2.publishing import POSE, PosePublisher
 from evercal.recordings.formats.bags.file import IMAGE, TF
 
@@ -27,7 +27,6 @@ SECONDS = 5.0
 """Time that images are received."""
 SIZE = (720, 1280)
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
-_TYPES: dict[str, Any] = dict(_STORE.types)
 
 
 def run(domain: int = 77) -> None:
@@ -91,8 +90,8 @@ class Peer:
 def _images(peer: Peer, quality: str) -> Row:
     pixels = np.random.default_rng(0).integers(0, 255, (*SIZE, 3), np.uint8)
     height, width = SIZE
-    make = _TYPES[IMAGE]
-    message = make(_header(), height, width, "rgb8", 0, 3 * width, pixels.ravel())
+    words = (height, width, "rgb8", 0, 3 * width, pixels.ravel())
+    message = make(IMAGE, header("camera", 5.0), *words)
     count = 0
     with peer.publishing("/cam/image_raw", IMAGE, message, quality, "volatile"):
         camera = Ros2Camera("ros2:/cam/image_raw")
@@ -109,11 +108,12 @@ def _images(peer: Peer, quality: str) -> Row:
 
 
 def _late(peer: Peer) -> Row:
-    make = _TYPES["geometry_msgs/msg/Transform"]
-    place = _TYPES["geometry_msgs/msg/Vector3"](1.0, 2.0, 3.0)
-    moved = make(place, _TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0))
-    moved = _TYPES["geometry_msgs/msg/TransformStamped"](_header(), "tool0", moved)
-    message = _TYPES[TF[0]]([moved])
+    place = make("geometry_msgs/msg/Vector3", 1.0, 2.0, 3.0)
+    turn = make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+    moved = make("geometry_msgs/msg/Transform", place, turn)
+    own = header("base", 5.0)
+    moved = make("geometry_msgs/msg/TransformStamped", own, "tool0", moved)
+    message = make(TF[0], [moved])
     with peer.publishing("/tf_static", TF[0], message, "reliable", "latched"):
         time.sleep(2.0)
         topic = Graph().subscribe("/tf_static", TF[0], True, True, 100)
@@ -133,8 +133,3 @@ def _published(peer: Peer) -> Iterator[Row]:
     for topic, kind in zip(publisher.topics, (TF[0], POSE), strict=True):
         arrived = peer.received(topic, kind, "reliable", "latched")
         yield {"what": f"{topic} of evercal", "arrived": "yes" if arrived else "-"}
-
-
-def _header() -> Any:
-    stamp = _TYPES["builtin_interfaces/msg/Time"](5, 0)
-    return _TYPES["std_msgs/msg/Header"](stamp, "camera")

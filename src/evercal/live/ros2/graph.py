@@ -23,6 +23,7 @@ from cyclonedds.core import (
     ReadCondition,
     SampleState,
     ViewState,
+    WaitSet,
 )
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import make_idl_struct, types
@@ -133,6 +134,9 @@ class Subscription:
         self.topic = topic
         self.kind = kind
         self._reader = reader
+        self._arrived = ReadCondition(reader, _ALIVE)
+        self._waiting = WaitSet(reader.participant)
+        self._waiting.attach(self._arrived)
 
     def take(self) -> list[Message]:
         """Those that have arrived, oldest first."""
@@ -145,7 +149,8 @@ class Subscription:
         end = math.inf if timeout_s is None else time.monotonic() + timeout_s
         while time.monotonic() < end:
             # Signals such as Ctrl-C wait as long as Cyclone does.
-            for sample in self._reader.take_iter(timeout=_WAIT_NS):
+            self._waiting.wait(_WAIT_NS)
+            for sample in self._reader.take(1, self._arrived):
                 return self._decoded(sample)
         return None
 
@@ -165,6 +170,13 @@ def _kind(writer: Any) -> str:
 def make(kind: str, *values: Any) -> Any:
     """A message such as `std_msgs/msg/Header` of its fields in order."""
     return _STORE.types[kind](*values)
+
+
+def header(frame: str, stamp_s: float) -> Any:
+    """The header of a message of a frame, at a time in seconds."""
+    whole, nanoseconds = divmod(round(stamp_s * 1e9), 10**9)
+    stamp = make("builtin_interfaces/msg/Time", whole, nanoseconds)
+    return make("std_msgs/msg/Header", stamp, frame)
 
 
 def _qos(reliable: bool, latched: bool, depth: int) -> Qos:

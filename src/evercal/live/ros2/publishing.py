@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from evercal.geometry import UncertainPose
-from evercal.live.ros2.graph import Graph, make
+from evercal.live.ros2.graph import Graph, header, make
 from evercal.recordings.formats.bags.file import TF
 from evercal.typing import Array
 
@@ -32,22 +32,20 @@ class PosePublisher:
 
     def publish(self, pose: UncertainPose, stamp_s: float) -> None:
         """Send a pose that holds at a time, seconds."""
-        time = divmod(round(stamp_s * 1e9), 10**9)
-        stamp = make("builtin_interfaces/msg/Time", *time)
-        header = make("std_msgs/msg/Header", stamp, self._parent)
+        own = header(self._parent, stamp_s)
         w, x, y, z = pose.pose.rotation_wxyz.tolist()
         place = pose.pose.translation_m.tolist()
         rotation = make("geometry_msgs/msg/Quaternion", x, y, z, w)
         vector = make("geometry_msgs/msg/Vector3", *place)
         moved = make("geometry_msgs/msg/Transform", vector, rotation)
         child = self._child
-        moved = make("geometry_msgs/msg/TransformStamped", header, child, moved)
+        moved = make("geometry_msgs/msg/TransformStamped", own, child, moved)
         self._tf(make(TF[0], [moved]))
         point = make("geometry_msgs/msg/Point", *place)
         plain = make("geometry_msgs/msg/Pose", point, rotation)
         covariance = about_fixed_axes(pose).ravel()
         stated = make("geometry_msgs/msg/PoseWithCovariance", plain, covariance)
-        self._pose(make(POSE, header, stated))
+        self._pose(make(POSE, own, stated))
 
 
 def about_fixed_axes(pose: UncertainPose) -> Array:

@@ -50,24 +50,16 @@ class Ros2Robot:
         problem = ""
         with self._lock:
             while time.monotonic() < end:
-                for topic in self._topics:
-                    for message in topic.take():
-                        self._tree.add_message(message, self._zero_ns)
+                self._listen()
                 try:
-                    names = self.frames
-                    base = self._tree.frame(names.base, BASES, "base_frame")
-                    gripper = self._tree.frame(names.gripper, GRIPPERS, "gripper_frame")
-                    self.frames = FrameNames(base, gripper)
-                    until = self._tree.until(base, gripper)
+                    base, gripper = self._named()
+                    until = self._tree.until(base, gripper)  # infinite: nothing moves
                     before = min(before, until)
                     wanted = until if stamp_s is None else stamp_s
-                    poses, valid = self._tree.a_from_b(
-                        base, gripper, np.array([wanted])
-                    )
-                    # Infinite if nothing moves.
-                    if valid[0] and (
-                        stamp_s is not None or until > before or before == np.inf
-                    ):
+                    times = np.array([wanted])
+                    poses, valid = self._tree.a_from_b(base, gripper, times)
+                    is_new = until > before or before == np.inf
+                    if valid[0] and (stamp_s is not None or is_new):
                         return poses[0]
                     what = f"ros2:/tf: no pose of {gripper} in {base}"
                     problem = f"{what} arrives any more; check its publisher"
@@ -84,3 +76,16 @@ class Ros2Robot:
                 "ros2:/tf: nothing arrives; check the robot's driver and ROS_DOMAIN_ID"
             )
         raise InputError(problem)
+
+    def _listen(self) -> None:
+        for topic in self._topics:
+            for message in topic.take():
+                self._tree.add_message(message, self._zero_ns)
+
+    def _named(self) -> tuple[str, str]:
+        """The frames that were named, else those with usual names."""
+        names = self.frames
+        base = self._tree.frame(names.base, BASES, "base_frame")
+        gripper = self._tree.frame(names.gripper, GRIPPERS, "gripper_frame")
+        self.frames = FrameNames(base, gripper, names.camera)
+        return base, gripper
