@@ -41,6 +41,10 @@ class Bounds:
     """Values in a YAML file."""
     elements: int = 500_000
     """Elements of a URDF; a chain of 20,000 links has 140,000."""
+    mesh_bytes: int = 200_000_000
+    """All mesh files of a robot."""
+    faces: int = 2_000_000
+    """Triangles of all meshes of a robot."""
     numbers: int = 10_000_000
     """Numbers of an array, and cells of a table."""
     recording_files: int = 200_000

@@ -1,4 +1,4 @@
-"""`parsed_urdf`: links and joints of a URDF, by one strict reading of its XML."""
+"""Links, joints and geometry of a URDF, by one strict reading of its XML."""
 
 from collections.abc import Mapping
 from difflib import get_close_matches
@@ -32,6 +32,13 @@ _DEFAULTS = {
 """Numbers of a joint, and what they are if they are omitted."""
 _PARTS = {"parent", "child", "origin", "axis", "mimic", "limit"}
 """Elements of a joint that count."""
+_SIZES = {
+    "mesh": {"mesh scale": 3},
+    "box": {"box size": 3},
+    "cylinder": {"cylinder radius": 1, "cylinder length": 1},
+    "sphere": {"sphere radius": 1},
+}
+"""Numbers of each shape."""
 _KNOWN = {
     *_ENDS,
     *_DEFAULTS,
@@ -40,7 +47,7 @@ _KNOWN = {
 
 
 class Element(NamedTuple):
-    """A link or a joint as the file states it."""
+    """A link, its geometry, or a joint as the file states it."""
 
     tag: str
     stated: dict[str, str]
@@ -79,6 +86,23 @@ class Joint:
         return ""
 
 
+class Geometry(NamedTuple):
+    """A visual or collision element of a link."""
+
+    link: str
+    kind: str
+    """visual or collision."""
+    shape: str
+    """mesh, box, cylinder or sphere; empty if none of them is stated."""
+    file: str
+    """File of a mesh."""
+    sizes: list[float]
+    """Scale of a mesh, size of a box, radius and length of a cylinder, or radius of a sphere."""
+    xyz: list[float]
+    rpy: list[float]
+    """Its origin in the link."""
+
+
 def parsed_urdf(data: bytes) -> tuple[Strings, tuple[Joint, ...]]:
     """Names of links, and the joints, in the order of the file; all else is skipped.
 
@@ -88,6 +112,8 @@ def parsed_urdf(data: bytes) -> tuple[Strings, tuple[Joint, ...]]:
     links = []
     joints = []
     for element in _elements(data):
+        if element.tag in ("visual", "collision"):
+            continue
         with naming(f"{element.tag} {element.stated.get('name')}"):
             try:
                 if element.tag == "joint":
@@ -101,20 +127,69 @@ def parsed_urdf(data: bytes) -> tuple[Strings, tuple[Joint, ...]]:
     return tuple(links), tuple(joints)
 
 
+def stated_geometry(data: bytes) -> list[Geometry]:
+    """Visual and collision geometry of all links, in the order of the file.
+
+    Raises:
+        ValueError: A number of it is missing or wrong.
+    """
+    found = []
+    for element in _elements(data):
+        if element.tag in ("visual", "collision"):
+            link = element.stated["link"]
+            with naming(f"{element.tag} of link {link}"):
+                found.append(_geometry(link, element))
+    return found
+
+
+def _geometry(link: str, element: Element) -> Geometry:
+    stated = {"mesh scale": "1 1 1", **element.stated}
+    shapes = [shape for shape in _SIZES if shape in element.starts]
+    shape = "".join(shapes[:1])
+    sizes = []
+    for key, count in _SIZES.get(shape, {}).items():
+        sizes += _numbers(stated.get(key, ""), count)
+    origin = [
+        _numbers(stated.get(f"origin {part}", "0 0 0"), 3) for part in ("xyz", "rpy")
+    ]
+    file = stated.get("mesh filename", "")
+    return Geometry(link, element.tag, shape, file, sizes, *origin)
+
+
+def _numbers(text: str, count: int, finite: bool = True) -> list[float]:
+    """So many numbers of an attribute."""
+    numbers = [*map(float, text.split())]
+    largest = float(np.abs(numbers).max(initial=0))  # nan if any of them is
+    if len(numbers) != count or (finite and not largest < _MOST):
+        words = "three finite numbers"
+        if count == 1:
+            words = "one finite number"
+        raise ValueError(f"'{text}' are not {words}")
+    return numbers
+
+
 def _elements(data: bytes) -> list[Element]:
     """Links and joints of the robot. As in ROS, prefixes of names need no declaration."""
     blank = len(data) - len(data.lstrip())
     above: list[str] = []
     elements: list[Element] = []
     count = 0
+    link = ""
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal count
+        nonlocal count, link
         count += 1
         require_at_most(count, "elements", "elements in XML")
         start = parser.CurrentByteIndex + blank
         if len(above) == 1 and tag in ("link", "joint"):
             elements.append(Element(tag, attributes, {tag: start}))
+            link = attributes.get("name", "")
+        elif above[1:] == ["link"] and tag in ("visual", "collision"):
+            elements.append(Element(tag, {"link": link}, {tag: start}))
+        elif above[1:2] == ["link"] and above[2:3] in (["visual"], ["collision"]):
+            elements[-1].starts.setdefault(tag, start)
+            for key, value in attributes.items():
+                elements[-1].stated.setdefault(f"{tag} {key}", value)
         elif len(above) == 2 and above[1] == "joint":
             if tag in elements[-1].starts and tag in _PARTS:
                 name = elements[-1].stated.get("name")
@@ -147,14 +222,6 @@ def _joint(element: Element) -> Joint:
     numbers = {}
     for key, default in _DEFAULTS.items():
         text = element.stated.get(key, default)
-        count = len(default.split())
-        numbers[key] = [*map(float, text.split())]
-        largest = float(np.abs(numbers[key]).max(initial=0))  # nan if any of them is
-        finite = key.startswith("limit") or largest < _MOST
-        if len(numbers[key]) != count or not finite:
-            words = (
-                "one finite number",
-                "three finite numbers",
-            )
-            raise ValueError(f"'{text}' are not {words[count > 1]}")
+        finite = not key.startswith("limit")
+        numbers[key] = _numbers(text, len(default.split()), finite)
     return Joint(name, kind, parent, child, numbers, element)
