@@ -1,10 +1,12 @@
 """Surfaces of links: tiny URDFs with primitives and meshes that the test writes."""
 
+import os
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from evercal.errors import InputError
 from evercal.robot.link_shapes import RobotBody, robot_body
@@ -130,20 +132,26 @@ def test_a_mirrored_mesh_still_shows_its_outside(tmp_path: Path) -> None:
     assert volume == pytest.approx(np.einsum("ij,ij", a, np.cross(b, c)) / 6)
 
 
-@pytest.mark.parametrize("place", ["near/meshes", "meshes", "near/robots", "other"])
-def test_packages_are_searched_above_the_urdf(
-    tmp_path: Path, place: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("place", "variable"),
+    [
+        ("near/urdf/meshes", ""),
+        ("near/meshes", ""),
+        ("arm/meshes", ""),
+        ("elsewhere/arm/meshes", "ROS_PACKAGE_PATH"),
+        ("elsewhere/meshes", "ROS_PACKAGE_PATH"),
+        ("elsewhere/share/arm/meshes", "AMENT_PREFIX_PATH"),
+    ],
+)
+def test_packages_are_searched(
+    tmp_path: Path, place: str, variable: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "near" / "urdf"
     folder.mkdir(parents=True)
-    write_stl(tmp_path / place / "a" / "cube.stl")
-    name = "near/robots" if place == "near/robots" else "meshes"
-    if place == "other":
-        (tmp_path / "other" / "package.xml").write_text("<name> meshes </name>")
-        monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path / "other"))
-    if place == "near/robots":
-        name = "robots"
-    assert read(folder, mesh(f"package://{name}/a/cube.stl")).links
+    write_stl(tmp_path / place / "cube.stl")
+    if variable:
+        monkeypatch.setenv(variable, f"/nowhere{os.pathsep}{tmp_path / 'elsewhere'}")
+    assert read(folder, mesh("package://arm/meshes/cube.stl")).links
 
 
 def test_files_are_named_by_path(tmp_path: Path) -> None:
@@ -152,10 +160,39 @@ def test_files_are_named_by_path(tmp_path: Path) -> None:
     assert read(tmp_path, mesh(str(tmp_path / "a b.stl"))).links
 
 
-def test_collision_geometry_stands_for_a_visual_that_is_missing(tmp_path: Path) -> None:
+def test_collision_geometry_stands_for_visual_geometry_that_no_link_has(
+    tmp_path: Path,
+) -> None:
     body = read(tmp_path, ROOT.replace("visual", "collision"))
     assert len(body.links) == 1
-    assert body.notes == ("collision geometry stands for visual geometry of base",)
+    assert body.notes == (
+        "no link has visual geometry; collision geometry stands for it",
+    )
+    distance = ROOT.replace("visual", "collision").replace("base", "arm")
+    assert [link.link for link in read(tmp_path, ROOT + MOVED + distance).links] == [
+        "base"
+    ]
+
+
+def test_a_mesh_survives_a_missing_texture(tmp_path: Path) -> None:
+    write_dae(tmp_path / "cube.dae")
+    text = (tmp_path / "cube.dae").read_text()
+    bound = """<instance_geometry url="#g"><bind_material><technique_common>
+<instance_material symbol="m" target="#lost"/></technique_common></bind_material>
+</instance_geometry>"""
+    text = text.replace('<instance_geometry url="#g"/>', bound)
+    (tmp_path / "cube.dae").write_text(text)
+    assert read(tmp_path, mesh("cube.dae")).links
+
+
+def test_fine_meshes_are_simplified(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(6, 0.03)
+    assert len(ball.faces) > 80_000
+    ball.export(tmp_path / "ball.stl")
+    (link,) = read(tmp_path, mesh("ball.stl")).links
+    assert len(link.faces) < 60_000
+    radius = np.linalg.norm(link.vertices, axis=1)
+    np.testing.assert_allclose(radius, 0.03, atol=1e-5)
 
 
 def refused(problem: str, folder: Path, links: str, **options: object) -> None:
@@ -170,17 +207,18 @@ def test_bad_geometry_is_named(tmp_path: Path) -> None:
     for links, problem in (
         (
             mesh("lost.stl"),
-            f"link base: its mesh lost.stl is not found, .*{re.escape(str(tmp_path))}",
+            f"link base: its mesh lost.stl is not found in {re.escape(str(tmp_path))}, .*`without`",
         ),
         (mesh("cube.blend"), "link base: its mesh 'cube.blend' is none of stl, dae"),
         (mesh("cube.stl"), "link base: is 1000 m large; .*scale="),
         (mesh("cube.stl", 'scale="1 x 1"'), "visual of link base: could not convert"),
+        ('<link name="base"><visual><geometry/></visual></link>', "is no mesh, box"),
         (mesh("bad.stl"), "bad.stl: cannot be read as a mesh"),
         (mesh("bad.dae"), "bad.dae: cannot be read as a mesh .*DOCTYPE"),
         ('<link name="base"/>', "no link has geometry"),
     ):
         refused(problem, tmp_path, links)
-    refused("has no link bse .nearest: base.", tmp_path, ROOT, without=["bse"])
+    refused("has no link bse .nearest: base", tmp_path, ROOT, without=["bse"])
     refused("no link has geometry", tmp_path, ROOT, without=["base"])
 
 

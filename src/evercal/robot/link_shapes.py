@@ -1,4 +1,4 @@
-"""`robot_body`: the surfaces of a robot's links, from the visual geometry of its URDF."""
+"""`robot_body`: the surfaces of a robot's links, from the geometry of its URDF."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,8 +18,12 @@ from evercal.typing import Array, IntArray, Strings
 
 _SAME_M = 1e-5
 """Vertices so near are one."""
+_MANY = 20_000
+"""Links of more triangles are simplified."""
+_CELL_M = 0.001
+"""Cell in which their vertices become one: it moves 99 % of the surface by less than 0.3 mm."""
 _LARGEST_M = 20.0
-"""No link is larger; a finger in millimetres is."""
+"""No link is larger, and most are in millimetres."""
 
 
 @frozen_arrays
@@ -46,7 +50,7 @@ class RobotBody:
     arms: tuple[Arm, ...]
     """Chain from the base to each of them."""
     notes: Strings
-    """Joints without values and links without visual geometry."""
+    """Joints without values, and use of collision geometry."""
 
     def frames(self, values: Array) -> Array:
         """(links, n, 4, 4) base_from_link of joint values (n, k), radians or metres."""
@@ -66,7 +70,9 @@ def robot_body(
     base: str | None = None,
     without: Sequence[str] = (),
 ) -> RobotBody:
-    """Surfaces of all links that are connected to a link, its base.
+    """Surfaces of all links: their visual geometry, or the collision geometry of a robot without.
+
+    Links of other robots often have collision geometry alone to keep a distance.
 
     Args:
         model: The robot; its mesh files are read.
@@ -76,28 +82,29 @@ def robot_body(
         without: Links to leave out.
     """
     base = base or model.base_link
-    unknown = [link for link in (base, *without) if link not in model.links]
+    unknown = [link for link in without if link not in model.links]
     if unknown:
-        raise InputError(
-            f"{model.path}: has no link {few(unknown, model.links)}; it has"
-            f" {', '.join(model.links)}"
-        )
-    with named_errors(model.path, "URDF or a mesh of it"):
+        raise InputError(f"{model.path}: has no link {few(unknown, model.links)}")
+    notes = []
+    with named_errors(model.path, "mesh or URDF"):
         geometry = stated_geometry(model.path.read_bytes())
-        chosen, notes = _chosen(geometry, without)
-        links = _shapes(model, chosen)
+        shown = [part for part in geometry if part.kind == "visual"]
+        if not shown:
+            shown = geometry
+            notes.append(
+                "no link has visual geometry; collision geometry stands for it"
+            )
+        links = _links(model.path, [part for part in shown if part.link not in without])
     if not links:
         raise InputError(f"{model.path}: no link has geometry, so images show none")
-    arms = [model.arm(base, link.link) for link in links]
-    valueless = {
-        f"{name} at {value:.3g}": None
-        for arm in arms
-        for name, value in zip(arm.joints, _rest(arm), strict=True)
-        if name not in joints
-    }
-    if valueless:
-        notes.append(f"joints without values stand still: {', '.join(valueless)}")
-    return RobotBody(base, tuple(joints), tuple(links), tuple(arms), tuple(notes))
+    arms = tuple(model.arm(base, link.link) for link in links)
+    rest = {}
+    for arm in arms:
+        rest |= dict(zip(arm.joints, _rest(arm), strict=True))
+    still = [f"{name} at {rest[name]:.3g}" for name in rest if name not in joints]
+    if still:
+        notes.append(f"joints without values stand still: {', '.join(still)}")
+    return RobotBody(base, tuple(joints), tuple(links), arms, tuple(notes))
 
 
 def _rest(arm: Arm) -> Array:
@@ -106,73 +113,45 @@ def _rest(arm: Arm) -> Array:
     return np.where((lower <= 0) & (upper >= 0), 0.0, middle)
 
 
-def _chosen(
-    geometry: Sequence[Geometry], without: Sequence[str]
-) -> tuple[dict[str, list[Geometry]], list[str]]:
-    """Visual geometry by link, of links without it the collision geometry, and notes."""
-    kinds: dict[str, dict[str, list[Geometry]]] = {}
-    notes = []
+def _links(urdf: Path, geometry: Sequence[Geometry]) -> list[LinkShape]:
+    surfaces: dict[str, list[Triangles]] = {}
+    read = faces = 0
     for part in geometry:
-        if part.link in without:
-            continue
-        if not part.shape:
-            notes.append(
-                f"link {part.link}: {part.kind} geometry that is no mesh, box, cylinder or sphere"
-                " is left out"
-            )
-            continue
-        kinds.setdefault(part.link, {}).setdefault(part.kind, []).append(part)
-    chosen = {}
-    lacking = []
-    for link, of_link in kinds.items():
-        chosen[link] = of_link.get("visual") or of_link["collision"]
-        if "visual" not in of_link:
-            lacking.append(link)
-    if lacking:
-        notes.append(
-            f"collision geometry stands for visual geometry of {', '.join(lacking)}"
+        with naming(f"link {part.link}"):
+            if part.shape == "mesh":
+                file = mesh_file(urdf, part.file)
+                read += file.stat().st_size
+                require_at_most(read, "mesh_bytes", "bytes of meshes")
+                surface = _scaled(read_mesh(file), part.sizes)
+            else:
+                surface = _primitive(part)
+            faces += len(surface.faces)
+            require_at_most(faces, "faces", "triangles of meshes")
+        turned = surface.vertices @ Rotation.from_euler("xyz", part.rpy).as_matrix().T
+        surface = surface._replace(vertices=turned + part.xyz)
+        surfaces.setdefault(part.link, []).append(surface)
+    links = [_link(name, joined(parts)) for name, parts in surfaces.items()]
+    return [link for link in links if len(link.faces)]
+
+
+def _link(name: str, surface: Triangles) -> LinkShape:
+    size = np.ptp(surface.vertices, axis=0).max()
+    if size > _LARGEST_M:
+        raise ValueError(
+            f"link {name}: is {size:.4g} m large; lengths are metres; give a mesh in millimetres"
+            ' scale="0.001 0.001 0.001"'
         )
-    return chosen, notes
+    cell = _SAME_M
+    if len(surface.faces) > _MANY:
+        cell = _CELL_M
+    return LinkShape(name, *merged(surface, cell))
 
 
-def _shapes(model: RobotModel, chosen: dict[str, list[Geometry]]) -> list[LinkShape]:
-    shapes = []
-    size_bytes = faces = 0
-    for link, parts in chosen.items():
-        surfaces = []
-        for part in parts:
-            with naming(f"link {link}"):
-                file = None
-                if part.shape == "mesh":
-                    file = mesh_file(model.path, part.file)
-                    size_bytes += file.stat().st_size
-                    require_at_most(size_bytes, "mesh_bytes", "bytes of meshes")
-                surfaces.append(_surface(part, file))
-                faces += len(surfaces[-1].faces)
-                require_at_most(faces, "faces", "triangles of meshes")
-        mesh = merged(joined(surfaces), _SAME_M)
-        if not len(mesh.faces):
-            continue
-        size = np.ptp(mesh.vertices, axis=0).max()
-        if size > _LARGEST_M:
-            raise ValueError(
-                f"link {link}: is {size:.4g} m large; lengths of a URDF are metres; give meshes in"
-                ' millimetres scale="0.001 0.001 0.001"'
-            )
-        shapes.append(LinkShape(link, *mesh))
-    return shapes
-
-
-def _surface(part: Geometry, file: Path | None) -> Triangles:
-    if file is None:
-        vertices, faces = _primitive(part)
-    else:
-        vertices, faces = read_mesh(file)
-        vertices = vertices * part.sizes
-        if np.prod(part.sizes) < 0:
-            faces = faces[:, ::-1]
-    turned = Rotation.from_euler("xyz", part.rpy).as_matrix()
-    return Triangles(vertices @ turned.T + part.xyz, faces)
+def _scaled(mesh: Triangles, scale: Sequence[float]) -> Triangles:
+    faces = mesh.faces
+    if np.prod(scale) < 0:
+        faces = faces[:, ::-1]
+    return Triangles(mesh.vertices * scale, faces)
 
 
 def _primitive(part: Geometry) -> Triangles:
@@ -181,6 +160,8 @@ def _primitive(part: Geometry) -> Triangles:
         mesh = creation.box(part.sizes)
     elif part.shape == "cylinder":
         mesh = creation.cylinder(*part.sizes, sections=64)
-    else:
+    elif part.shape == "sphere":
         mesh = creation.icosphere(4, *part.sizes)
+    else:
+        raise ValueError(f"its {part.kind} is no mesh, box, cylinder or sphere")
     return Triangles(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
