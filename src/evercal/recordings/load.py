@@ -48,17 +48,32 @@ FORMATS: dict[FormatName, RecordingFormat] = {
     "wrist": RecordingFormat(
         "wrist",
         "images beside base_from_gripper.csv, joints.csv, base_from_camera.csv",
-        ("camera", "urdf", "pose_convention"),
+        ("camera", "urdf", "whole_robot", "pose_convention"),
     ),
     "lerobot": RecordingFormat(
         "lerobot",
         "meta/info.json",
-        ("camera", "image_topic", "gripper_frame", "urdf", "pose_convention"),
+        (
+            "camera",
+            "image_topic",
+            "gripper_frame",
+            "urdf",
+            "whole_robot",
+            "pose_convention",
+        ),
     ),
     "rosbag": RecordingFormat(
         "ros_bag",
         "a .bag or .mcap file or bag folder",
-        ("camera", "image_topic", "pose_topic", "base_frame", "gripper_frame", "urdf"),
+        (
+            "camera",
+            "image_topic",
+            "pose_topic",
+            "base_frame",
+            "gripper_frame",
+            "urdf",
+            "whole_robot",
+        ),
     ),
 }
 """All formats by name, in the order in which they are tried."""

@@ -33,6 +33,9 @@ class ReadOptions:
     metres: bool = False
     """The lengths of a COLMAP or nerfstudio recording are metres. If omitted, their unit is
     unknown."""
+    whole_robot: bool = False
+    """Read the values of all joints that the URDF has, as for the arm in the images, instead of
+    gripper poses, which are those of the base then."""
     every: int = 1
     """Take every N-th image; 1 for all."""
 
@@ -40,6 +43,8 @@ class ReadOptions:
         """Refuse a step that takes no image."""
         if self.every < 1:
             raise InputError(f"`every` {self.every}: give a number >= 1")
+        if self.whole_robot and self.gripper_frame:
+            raise InputError("`gripper_frame`: all joints are read; leave it out")
 
     def given(self) -> tuple[str, ...]:
         """Names of the fields that differ from their defaults."""

@@ -97,7 +97,7 @@ class RobotModel:
         names their origin in messages.
         """
         base, gripper = self.chosen_links(base, gripper)
-        arm = self.arm(base, gripper)
+        arm = self.read_arm(base, gripper, names, source)
         missing = [name for name in arm.joints if name not in names]
         if missing:
             raise InputError(
@@ -116,6 +116,13 @@ class RobotModel:
         if gripper != base:
             frames = FrameNames(base, gripper)
         return ArmPoses(arm.poses(values), arm, values, notes, frames)
+
+    def read_arm(
+        self, base: str, gripper: str, names: Sequence[str], source: PathLike
+    ) -> Arm:
+        """The arm whose values are taken from those of some names."""
+        del names, source
+        return self.arm(base, gripper)
 
     def arm(self, base: str, gripper: str) -> Arm:
         """The chain between two links; its joint values are those that others do not mimic."""
@@ -149,15 +156,24 @@ class RobotModel:
                 before = np.eye(4)
             if backwards:
                 before = before @ np.linalg.inv(origin)
+        joints = tuple(names)
+        return Arm(joints, tuple(chain), before, self.ranges(joints), self.path.name)
+
+    def ranges(self, joints: Sequence[str]) -> Array:
+        """(k, 3) lower limit, middle and upper limit of joints."""
         limits = [
             self._joint_named[name].numbers[end]
-            for name in names
+            for name in joints
             for end in ("limit lower", "limit upper")
         ]
         within = np.reshape(limits, (-1, 2)).clip(-_LARGEST_RAD, _LARGEST_RAD)
         lower, upper = within.T
-        ranges = np.stack([lower, (lower + upper) / 2, upper], 1)
-        return Arm(tuple(names), tuple(chain), before, ranges, self.path.name)
+        return np.stack([lower, (lower + upper) / 2, upper], 1)
+
+    def drivers(self) -> list[str]:
+        """Names of the joints that move and mimic none."""
+        moving = [joint for joint in self._joints if joint.type in _MOVING]
+        return [joint.name for joint in moving if "mimic" not in joint.element.starts]
 
     def origins_with(self, offsets: Mapping[str, float]) -> dict[str, tuple[SE3, bool]]:
         """Origins of the joints that move by some values, with offsets of these values.

@@ -207,6 +207,10 @@ def test_joints_and_a_urdf_in_radians_or_degrees(tmp_path: Path) -> None:
             turn = SE3.exp([0, 0, 0, 0, 0, shoulder * unit])
             expected = turn @ SE3.exp([0.5 + reach, 0, 0, 0, 0, 0])
             assert_pose(frame.base_from_gripper, expected, 1e-6)
+    whole = load_recording(root, options=options(root, urdf=urdf, whole_robot=True))
+    assert whole.arm
+    assert whole.arm.joints == ("shoulder", "reach")
+    assert whole.train[5].joints_rad == pytest.approx(joints(0, 5))
     message = "grad: joint angles are rad or deg"
     refuses(message, root, urdf=urdf, pose_convention="grad")
     assert recording.frames == FrameNames("base", "tip")

@@ -20,7 +20,7 @@ from evercal.recordings.cameras import camera_fields, camera_file
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, files_in, first_size
 from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
-from evercal.recordings.poses.joint_tables import read_joint_poses
+from evercal.recordings.poses.joint_tables import read_joint_poses, robot_of
 from evercal.recordings.poses.pairing import pair_images, pair_joints
 from evercal.recordings.poses.robot_poses import (
     POSE_ENDINGS,
@@ -30,7 +30,6 @@ from evercal.recordings.poses.robot_poses import (
 from evercal.recordings.poses.row_files import number_array, read_rows, same_numbers
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.frame_names import FrameNames
-from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import named_errors, read_json, refuse_repeated
 
 
@@ -158,7 +157,8 @@ def _frames(root: Path, layout: RecordingLayout, options: ReadOptions) -> Record
     split = layout.images.rpartition("rgb")[0]
     frames = []
     for image, camera, pose, values in zip(images, cameras, poses, joints, strict=True):
-        if pose is not None:
+        has_joints = values is not None or rows.joints is None
+        if pose is not None and has_joints:
             angles = None if values is None else tuple(values.tolist())
             frame = Frame(split + image.name, image, camera, None, joints_rad=angles)
             frames.append(replace(frame, **{owner: pose}))
@@ -180,7 +180,7 @@ def _rows(
     root: Path, file: Path, options: ReadOptions, convention: str | None
 ) -> tuple[RobotPoses, list[str]]:
     if file.name in _JOINTS:
-        model = RobotModel(options.urdf or _urdf(root, file))
+        model = robot_of(options.urdf or _urdf(root, file), options)
         links = options.base_frame, options.gripper_frame
         return read_joint_poses(file, model, *links, options.pose_convention)
     if file.name.startswith("metadata"):

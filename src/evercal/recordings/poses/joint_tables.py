@@ -13,7 +13,9 @@ from evercal.errors import InputError
 from evercal.recordings.poses.pose_track import times_around
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import LabelledRows, read_rows, row_labels
+from evercal.recordings.read_options import ReadOptions
 from evercal.robot.robot_model import ArmPoses, RobotModel
+from evercal.robot.whole_robot import WholeRobot
 from evercal.storage.text_files import (
     library_errors,
     named_errors,
@@ -31,6 +33,13 @@ _JSON = (
 )
 
 
+def robot_of(urdf: Path, options: ReadOptions) -> RobotModel:
+    """The robot whose joint values are read: its arm, or all of it."""
+    if options.whole_robot:
+        return WholeRobot(urdf)
+    return RobotModel(urdf)
+
+
 def read_joint_poses(
     path: Path,
     model: RobotModel,
@@ -44,10 +53,6 @@ def read_joint_poses(
     """
     rows = read_joints(path)
     base, gripper = model.chosen_links(base, gripper)
-    if not model.arm(base, gripper).joints:
-        raise InputError(
-            f"{model.path}: no joint moves {gripper} against {base}; name other links"
-        )
     names = []
     units = []
     for column in rows.columns:
@@ -61,6 +66,10 @@ def read_joint_poses(
             ending = unit
         names.append(joint)
         units.append(ending)
+    if not model.read_arm(base, gripper, names, path).joints:
+        raise InputError(
+            f"{model.path}: no joint moves {gripper} against {base}; name other links"
+        )
     with named_errors(path, "joint angles"):
         refuse_repeated(filter(model.has_joint, names), "keep one column of each joint")
     values = in_radians(model, names, rows.values, units)

@@ -70,7 +70,7 @@ def pair_joints(
     stamps_s: Mapping[str, float] | None,
     file: Path,
 ) -> list[Array | None]:
-    """Joint values (k,) of every image, paired as its pose; None without any."""
+    """Joint values (k,) of every image, paired as its pose; None without any, or in a gap."""
     values = rows.joints
     if values is None:
         return [None] * len(images)
@@ -81,8 +81,12 @@ def pair_joints(
     if times is None or rows.stamps_s is None:
         return list(values)
     stamps = rows.stamps_s
-    at_images = [interpolate(stamps, column, times)[0] for column in values.T]
-    return list(np.transpose(at_images))
+    columns = [interpolate(stamps, column, times) for column in values.T]
+    at_images: list[Array | None] = [*np.transpose([value for value, _ in columns])]
+    valid = np.all([is_valid for _, is_valid in columns], 0)
+    for index in np.flatnonzero(~valid):
+        at_images[index] = None
+    return at_images
 
 
 def poses_of_images(

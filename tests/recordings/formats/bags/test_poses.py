@@ -86,6 +86,11 @@ def test_joint_states_with_a_urdf_replace_tf(tmp_path: Path, urdf: Path) -> None
     assert recording.untracked == 1
     for frame, at in zip(recording.train, (0.25, 1.99), strict=True):
         assert_pose(frame.base_from_gripper, turned(at), 1e-7)
+    whole = load_recording(path, options=ReadOptions(urdf=urdf, whole_robot=True))
+    assert whole.untracked == 1
+    assert whole.arm
+    assert whole.arm.joints == ("turn",)
+    assert whole.train[0].joints_rad == pytest.approx((0.25,))
     message = "so there are no gripper poses; record /tf and /tf_static, or give the robot's `urdf`"
     assert f"{message} for /joint_states" in refusal_of(path)
     urdf.write_text(TURNING.replace('"turn"', '"wheel"'))

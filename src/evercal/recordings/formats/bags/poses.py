@@ -15,7 +15,7 @@ from evercal.recordings.formats.bags.tf_tree import (
     STATIC,
     TfTree,
 )
-from evercal.recordings.poses.joint_tables import interpolate, poses_of_arm
+from evercal.recordings.poses.joint_tables import interpolate, poses_of_arm, robot_of
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.frame_names import FrameNames
@@ -44,7 +44,8 @@ def poses_at_images(
     zero = int(stamps_ns[0])
     stamps = (stamps_ns - zero).astype(float) * 1e-9
     if options.urdf is not None:
-        return _from_joints(bag, stamps, zero, RobotModel(options.urdf), options)
+        model = robot_of(options.urdf, options)
+        return _from_joints(bag, stamps, zero, model, options)
     tree, times = _tf(bag, zero, options.pose_topic)
     base = tree.frame(options.base_frame, BASES, "base_frame")
     gripper = tree.frame(options.gripper_frame, GRIPPERS, "gripper_frame")
@@ -108,7 +109,7 @@ def _from_joints(
     values = np.zeros((len(stamps), len(tracks)))
     valid = np.ones(len(stamps), bool)
     times = np.empty(0)
-    needed = model.arm(base, gripper).joints
+    needed = model.read_arm(base, gripper, [*tracks], bag.path).joints
     for column, (name, track) in enumerate(tracks.items()):
         if name not in needed:
             continue
