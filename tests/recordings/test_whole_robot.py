@@ -79,7 +79,7 @@ def test_all_values_of_joints_are_read(folder: Path) -> None:
 
 
 def test_without_it_one_end_is_asked_for(folder: Path) -> None:
-    write_csv(folder, NAMES, np.zeros((3, 4)))
+    write_csv(folder, NAMES, [[0.0] * 4] * 3)
     with pytest.raises(
         InputError, match="has 3 ends; name the link with `gripper_frame`"
     ):
@@ -118,7 +118,7 @@ def test_values_are_interpolated_but_not_over_gaps_in_which_a_joint_moves(
 
 
 def test_no_joint_in_common_names_both_lists(folder: Path) -> None:
-    write_csv(folder, ("a1", "a2"), np.zeros((3, 2)))
+    write_csv(folder, ("a1", "a2"), [[0.0] * 2] * 3)
     message = r"no value is of a joint of .*robot.urdf; given are a1, a2, its joints are rail_j"
     with pytest.raises(InputError, match=message):
         read(folder)

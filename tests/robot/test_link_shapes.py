@@ -138,6 +138,7 @@ def test_a_mirrored_mesh_still_shows_its_outside(tmp_path: Path) -> None:
         ("near/urdf/meshes", ""),
         ("near/meshes", ""),
         ("arm/meshes", ""),
+        ("models/arm/meshes", ""),
         ("elsewhere/arm/meshes", "ROS_PACKAGE_PATH"),
         ("elsewhere/meshes", "ROS_PACKAGE_PATH"),
         ("elsewhere/share/arm/meshes", "AMENT_PREFIX_PATH"),
@@ -149,9 +150,12 @@ def test_packages_are_searched(
     folder = tmp_path / "near" / "urdf"
     folder.mkdir(parents=True)
     write_stl(tmp_path / place / "cube.stl")
+    package = "arm"
+    if "models" in place:
+        package = "project/models/arm"
     if variable:
         monkeypatch.setenv(variable, f"/nowhere{os.pathsep}{tmp_path / 'elsewhere'}")
-    assert read(folder, mesh("package://arm/meshes/cube.stl")).links
+    assert read(folder, mesh(f"package://{package}/meshes/cube.stl")).links
 
 
 def test_files_are_named_by_path(tmp_path: Path) -> None:
@@ -181,7 +185,8 @@ def test_a_mesh_survives_a_missing_texture(tmp_path: Path) -> None:
 <instance_material symbol="m" target="#lost"/></technique_common></bind_material>
 </instance_geometry>"""
     text = text.replace('<instance_geometry url="#g"/>', bound)
-    (tmp_path / "cube.dae").write_text(text)
+    # A line break before the declaration, as in files of Doosan.
+    (tmp_path / "cube.dae").write_text("\n" + text)
     assert read(tmp_path, mesh("cube.dae")).links
 
 
@@ -204,6 +209,10 @@ def test_bad_geometry_is_named(tmp_path: Path) -> None:
     write_stl(tmp_path / "cube.stl", 1000)
     (tmp_path / "bad.stl").write_bytes(b"no mesh")
     (tmp_path / "bad.dae").write_bytes(b"<!DOCTYPE x><x/>")
+    (tmp_path / "wide.dae").write_text("<!DOCTYPE x><x/>", "utf-16")
+    write_dae(tmp_path / "empty.dae")
+    text = (tmp_path / "empty.dae").read_text()
+    (tmp_path / "empty.dae").write_text(text.replace("triangles", "lines"))
     for links, problem in (
         (
             mesh("lost.stl"),
@@ -215,6 +224,11 @@ def test_bad_geometry_is_named(tmp_path: Path) -> None:
         ('<link name="base"><visual><geometry/></visual></link>', "is no mesh, box"),
         (mesh("bad.stl"), "bad.stl: cannot be read as a mesh"),
         (mesh("bad.dae"), "bad.dae: cannot be read as a mesh .*DOCTYPE"),
+        (mesh("wide.dae"), "wide.dae: cannot be read as a mesh .*DOCTYPE"),
+        (
+            mesh("empty.dae"),
+            "empty.dae: .*it has no triangles; leave the link out by `without`",
+        ),
         ('<link name="base"/>', "no link has geometry"),
     ):
         refused(problem, tmp_path, links)

@@ -11,17 +11,18 @@ from warnings import catch_warnings, simplefilter
 
 import numpy as np
 
+from evercal.bounds import require_at_most
 from evercal.errors import optional_module
-from evercal.storage.text_files import library_errors
+from evercal.storage.text_files import decoded, library_errors
 from evercal.typing import Array, IntArray
 
 _NEED = "meshes of a robot need trimesh and pycollada"
 _KINDS = ("stl", "dae", "obj", "ply")
 _PACKAGES = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
 """Environment variables of folders with ROS packages."""
-_UNIT = re.compile(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([^\"']*)")
-_MATERIALS = re.compile(rb"<(bind_material|library_effects)\b.*?</\1>", re.DOTALL)
-"""A DAE loses what has a material with a fault, such as a missing texture."""
+_MOST_NODES = 30
+"""Most repeated nodes of a DAE; public robots have one."""
+_DECLARATION = re.compile(r"^\s*<\?xml[^>]*>\s*")
 
 
 class Triangles(NamedTuple):
@@ -36,9 +37,8 @@ class Triangles(NamedTuple):
 def mesh_file(urdf: Path, name: str) -> Path:
     """The file that a URDF means by the name of a mesh.
 
-    It is searched beside the URDF, in the folders above it and in those of ROS packages. Without
-    the folder of its package it is searched last, as a package may have been copied under another
-    name.
+    It is searched in the folders above the URDF and in those of ROS packages, then without the
+    first folders of its name: a package may have been copied under another name.
 
     Raises:
         ValueError: There is none, or its format is unknown.
@@ -50,17 +50,17 @@ def mesh_file(urdf: Path, name: str) -> Path:
         path = unquote(path)
     roots = [*urdf.resolve().parents]
     for variable in _PACKAGES:
-        folders = os.environ.get(variable, "").split(os.pathsep)
-        roots += map(Path, filter(None, folders))
-    _, _, inside = path.partition("/")
-    for place in (path, f"share/{path}", inside):
+        for folder in filter(None, os.environ.get(variable, "").split(os.pathsep)):
+            roots += Path(folder), Path(folder, "share")
+    while path:
         for root in roots:
-            if (root / place).is_file():
-                return root / place
+            if (root / path).is_file():
+                return root / path
+        path = path.partition("/")[2]
     raise ValueError(
         f"its mesh {name} is not found in {urdf.parent}, the folders above it and those of"
-        f" {' and '.join(_PACKAGES)}; put the meshes beside the URDF, or"
-        " leave the link out by `without`"
+        f" {' and '.join(_PACKAGES)}; put the meshes beside the URDF, or leave the link out by"
+        " `without`"
     )
 
 
@@ -69,25 +69,45 @@ def read_mesh(path: Path) -> Triangles:
 
     As in RViz, the upward axis of a DAE does not count.
     """
-    data = path.read_bytes()
     kind = path.suffix[1:].lower()
-    trimesh = optional_module("trimesh", _NEED, "urdf")
-    scale = 1.0
+    data = path.read_bytes()
     with library_errors(f"{path}: cannot be read as a mesh"), catch_warnings():
         if kind == "dae":
-            optional_module("collada", _NEED, "urdf")
             simplefilter("ignore", PendingDeprecationWarning)  # it uses np.matrix
-            if b"<!DOCTYPE" in data:
-                raise ValueError("it has a DOCTYPE, which no mesh needs; remove it")
-            if unit := _UNIT.search(data):
-                scale = float(unit[1])
-            data = _MATERIALS.sub(b"", data)
-        mesh = trimesh.load_mesh(
-            BytesIO(data), kind, process=False, skip_materials=True
-        )
+            mesh = _collada(decoded(data))
+        else:
+            trimesh = optional_module("trimesh", _NEED, "urdf")
+            read = trimesh.load_mesh(
+                BytesIO(data), kind, process=False, skip_materials=True
+            )
+            mesh = Triangles(
+                np.array(read.vertices, float), np.array(read.faces, np.int64)
+            )
         if not len(mesh.faces):
-            raise ValueError("it holds no triangles")
-        return Triangles(scale * mesh.vertices, np.asarray(mesh.faces, np.int64))
+            raise ValueError("it has no triangles; leave the link out by `without`")
+    return mesh
+
+
+def _collada(text: str) -> Triangles:
+    """Triangles of COLLADA. Nodes may repeat nodes without limit, so their number is bounded."""
+    if "<!DOCTYPE" in text or text.count("instance_node") > _MOST_NODES:
+        raise ValueError("it has a DOCTYPE or many instance_node; export it without")
+    collada = optional_module("collada", _NEED, "urdf")
+    # A fault of a material, such as a missing texture, would cost what has it.
+    text = _DECLARATION.sub("", text).replace("bind_material", "extra")
+    document = collada.Collada(BytesIO(text.encode()), ignore=[collada.common.DaeError])
+    corners = [np.empty((0, 3))]
+    count = 0
+    for geometry in document.scene.objects("geometry"):
+        require_at_most(count, "faces", "triangles of meshes")
+        for part in geometry.primitives():
+            if hasattr(part, "triangleset"):
+                part = part.triangleset()
+            if isinstance(part, collada.triangleset.BoundTriangleSet):
+                corners.append(part.vertex[part.vertex_index.ravel()])
+                count += len(part)
+    vertices = np.concatenate(corners) * (document.assetInfo.unitmeter or 1.0)
+    return Triangles(vertices, np.arange(len(vertices)).reshape(-1, 3))
 
 
 def joined(parts: Sequence[Triangles]) -> Triangles:
