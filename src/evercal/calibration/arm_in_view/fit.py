@@ -1,0 +1,282 @@
+"""The pose of a camera by the outlines of an arm: robust Gauss-Newton, drawn anew in each step.
+
+Beside the pose it estimates what all images share and may be wrong, each with a prior: focal length,
+principal point, a common shift of all outlines outwards, and offsets of the joints.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from evercal.calibration.arm_in_view.outline import (
+    LinkEdges,
+    OutlinePoints,
+    image_offsets,
+    link_edges,
+    outline_points,
+)
+from evercal.calibration.arm_in_view.rasterizer import Drawing, Rasterizer
+from evercal.calibration.arm_in_view.views import ArmViews
+from evercal.classes import frozen_arrays
+from evercal.geometry import SE3, Camera
+from evercal.typing import Array, BoolArray, IntArray
+
+POSE = slice(0, 6)
+FOCAL = 6
+CENTRE = slice(7, 9)
+OUTLINE = 9
+JOINTS = 10
+"""Columns of the parameters; one for each joint value from `JOINTS` on."""
+LEAST_SCALE_PX = 0.3
+"""Least robust standard deviation of the residuals."""
+_LONGEST_STEP = 0.3
+"""Metres or radians."""
+_RETRIES = 2
+
+
+@frozen_arrays
+class Priors:
+    """Standard deviations of the parameters before the images."""
+
+    focal: float = 0.005
+    """Of the logarithm of the focal length."""
+    centre_px: float = 1.0
+    """Of the principal point."""
+    outline_px: float = 0.25
+    """Of a common shift of all outlines: light, blur, simplified meshes."""
+    joints: Array = field(default_factory=lambda: np.zeros(0))
+    """(k,) of the offsets of joint values; 0 of those that are not estimated."""
+
+    def sigma(self) -> Array:
+        """(10 + k,) of all parameters; infinite of the pose."""
+        pose = np.full(6, np.inf)
+        shared = [self.focal, self.centre_px, self.centre_px, self.outline_px]
+        return np.concatenate([pose, shared, self.joints])
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Pose of a camera, and what all images share."""
+
+    camera_from_base: SE3
+    camera: Camera
+    parameters: Array
+    """(10 + k,) their changes since the start; those of the pose are 0."""
+
+    @property
+    def offsets(self) -> Array:
+        """(k,) to be added to joint values."""
+        return self.parameters[JOINTS:]
+
+    def moved(self, step: Array) -> "Estimate":
+        """After a step (10 + k,)."""
+        pose = step[POSE]
+        longest = np.abs(pose).max()
+        pose = pose * min(1.0, _LONGEST_STEP / max(longest, 1e-12))
+        change = step.copy()
+        change[POSE] = 0
+        lens = change[FOCAL : CENTRE.stop]
+        camera = self.camera.changed(lens).pinhole
+        camera_from_base = SE3.exp(pose) @ self.camera_from_base
+        return Estimate(camera_from_base, camera, self.parameters + change)
+
+
+class Equations(NamedTuple):
+    """Residuals of outlines by the parameters: (m,) rows of several images."""
+
+    slopes: Array
+    """(m, 10 + k)."""
+    px: Array
+    """(m,)."""
+    image: IntArray
+    """(m,)."""
+    link: IntArray
+    """(m,)."""
+    testable: Array
+    """(n, links) number of points whose background is known."""
+
+
+@frozen_arrays
+class ArmFit:
+    """Result of a fit."""
+
+    estimate: Estimate
+    equations: Equations
+    weights: Array
+    """(m,) robust weights, 0 to 1."""
+    scale_px: float
+    """Robust standard deviation of the residuals."""
+    normal: Array
+    """(p, p) normal matrix of the free parameters, with priors."""
+    free: BoolArray
+    """(10 + k,)."""
+    priors: Priors
+
+    @property
+    def confirmed(self) -> float:
+        """Share of the outline that the images show, 0 to 1."""
+        return float(self.weights.sum() / max(self.equations.testable.sum(), 1))
+
+
+class Fitter:
+    """Fits outlines of a body to views."""
+
+    def __init__(self, views: ArmViews) -> None:
+        self.views = views
+        self.moving = moving_links(views)
+        self._rasterizer = Rasterizer(views.body)
+        self._edges: list[LinkEdges] = [*map(link_edges, views.body.links)]
+
+    def fit(
+        self,
+        start: Estimate,
+        priors: Priors,
+        images: Sequence[int],
+        reaches_px: Sequence[float],
+        spacing_px: float,
+        learn_at: Sequence[int] = (),
+    ) -> ArmFit:
+        """Fit the outlines of images; the background is learned again in steps of `learn_at`."""
+        estimate = start
+        for number, reach in enumerate(reaches_px):
+            frames = self._frames(estimate)
+            drawings = [self.draw(estimate, frames[:, i]) for i in images]
+            if number in learn_at:
+                self._learn(images, drawings, reach)
+            rows = [
+                self._rows(estimate, frames[:, i], i, drawing, (reach, spacing_px))
+                for i, drawing in zip(images, drawings, strict=True)
+            ]
+            equations = _joined(rows)
+            fit = solved(estimate, equations, priors)
+            estimate = fit.estimate
+        return fit
+
+    def start(self, camera_from_base: SE3) -> Estimate:
+        """A start with the stated camera and joint values."""
+        count = JOINTS + len(self.views.body.joints)
+        return Estimate(camera_from_base, self.views.camera, np.zeros(count))
+
+    def draw(self, estimate: Estimate, base_from_link: Array) -> Drawing:
+        """Draw the arm with link poses (links, 4, 4)."""
+        pose = estimate.camera_from_base.matrix()
+        return self._rasterizer.draw(pose @ base_from_link, estimate.camera)
+
+    def _frames(self, estimate: Estimate) -> Array:
+        return self.views.body.frames(self.views.values + estimate.offsets)
+
+    def _learn(
+        self, images: Sequence[int], drawings: Sequence[Drawing], reach: float
+    ) -> None:
+        import cv2
+
+        covered = np.ones(self.views.images.shape[:3], bool)
+        side = 2 * max(round(reach), 3) + 1
+        for i, drawing in zip(images, drawings, strict=True):
+            arm = (drawing.links >= 0).astype(np.uint8)
+            covered[i] = cv2.dilate(arm, np.ones((side, side), np.uint8)) > 0
+        self.views.learn_background(covered)
+
+    def _rows(
+        self,
+        estimate: Estimate,
+        base_from_link: Array,
+        i: int,
+        drawing: Drawing,
+        reach_and_spacing: tuple[float, float],
+    ) -> Equations:
+        """Residuals of one image."""
+        reach, spacing = reach_and_spacing
+        pose = estimate.camera_from_base.matrix()
+        camera = estimate.camera
+        links = pose @ base_from_link
+        points = outline_points(self._edges, links, camera, drawing, spacing)
+        points = points.at(self.moving[points.link])
+        offsets = image_offsets(self.views, i, points, reach)
+        testable = np.bincount(
+            points.link[offsets.testable], minlength=len(self._edges)
+        )
+        points = points.at(offsets.confirmed)
+        values = self.views.values[i] + estimate.offsets
+        slopes = self._slopes(points, camera, links, values)
+        px = offsets.px[offsets.confirmed]
+        owner = np.full(len(px), i)
+        return Equations(slopes, px, owner, points.link, testable[None])
+
+    def _slopes(
+        self, points: OutlinePoints, camera: Camera, links: Array, values: Array
+    ) -> Array:
+        """(m, 10 + k) motion along the normals by each parameter."""
+        body = self.views.body
+        x, y, z = points.in_camera.T
+        along = points.normals * [camera.fx, camera.fy]
+        depth = -(along[:, 0] * x + along[:, 1] * y) / z
+        by_point = np.stack([*along.T, depth], 1) / z[:, None]
+        slopes = np.zeros((len(z), JOINTS + len(body.joints)))
+        slopes[:, :3] = by_point
+        slopes[:, 3:6] = np.cross(points.in_camera, by_point)
+        from_centre = points.pixels - [camera.cx, camera.cy]
+        slopes[:, FOCAL] = (points.normals * from_centre).sum(1)
+        slopes[:, CENTRE] = points.normals
+        slopes[:, OUTLINE] = 1.0
+        for number in np.unique(points.link):
+            rows = points.link == number
+            arm = body.arms[number]
+            columns = [body.joints.index(name) for name in arm.joints if name in body.joints]
+            own = [k for k, name in enumerate(arm.joints) if name in body.joints]
+            if not own:
+                continue
+            motion = arm.slopes(body.arm_values(arm, values[None]))[0][:, own]
+            turned = np.cross(motion[3:].T, points.on_link[rows][:, None])
+            moved = (turned + motion[:3].T) @ links[number, :3, :3].T
+            slopes[np.ix_(rows, JOINTS + np.array(columns))] = np.einsum(
+                "mkc,mc->mk", moved, by_point[rows]
+            )
+        return slopes
+
+
+def moving_links(views: ArmViews) -> BoolArray:
+    """(links,) whether the motion of a link uncovers what is behind it."""
+    frames = views.body.frames(views.values)
+    moving = []
+    for shape, poses in zip(views.body.links, frames, strict=True):
+        corners = np.stack([shape.vertices.min(0), shape.vertices.max(0)])
+        middle = corners.mean(0) @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, :3, 3]
+        size = np.linalg.norm(np.ptp(corners, 0))
+        moving.append(np.linalg.norm(np.ptp(middle, 0)) > _MOVES * size)
+    return np.array(moving)
+
+
+_MOVES = 0.3
+"""Least way of the middle of a link that moves, in its sizes."""
+
+
+def _joined(rows: Sequence[Equations]) -> Equations:
+    return Equations(*map(np.concatenate, zip(*rows, strict=True)))
+
+
+def solved(estimate: Estimate, equations: Equations, priors: Priors) -> ArmFit:
+    """One robust Gauss-Newton step."""
+    sigma = priors.sigma()
+    free = sigma > 0
+    slopes = equations.slopes[:, free]
+    px = equations.px
+    if len(px) < 2 * free.sum():
+        raise TooFewPoints
+    scale = max(LEAST_SCALE_PX, 1.4826 * float(np.median(np.abs(px))))
+    weights = 1 / (1 + (px / (2 * scale)) ** 2) ** 2
+    weighted = slopes * weights[:, None] / scale**2
+    precision = 1 / sigma[free] ** 2
+    normal = weighted.T @ slopes + np.diag(precision)
+    right = weighted.T @ px - precision * estimate.parameters[free]
+    step = np.zeros(len(sigma))
+    step[free] = np.linalg.solve(normal, right)
+    return ArmFit(
+        estimate.moved(step), equations, weights, scale, normal, free, priors
+    )
+
+
+class TooFewPoints(ValueError):
+    """The images show too little of the outline."""
