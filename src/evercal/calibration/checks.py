@@ -63,6 +63,10 @@ class Checks:
     """Corners that leave their neighbours: image, x, y."""
     camera_sigma: Numbers | None = None
     """Standard deviations of the estimated intrinsics."""
+    outline_confirmed: float | None = None
+    """Share of the outline of an arm that the images show, 0 to 1."""
+    outline_sigma_px: float | None = None
+    """Robust standard deviation of the outlines."""
     other: Mapping[str, Any] = field(default_factory=dict)
     """Values of files that other programs wrote."""
 

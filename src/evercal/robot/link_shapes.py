@@ -54,14 +54,17 @@ class RobotBody:
 
     def frames(self, values: Array) -> Array:
         """(links, n, 4, 4) base_from_link of joint values (n, k), radians or metres."""
-        frames = []
-        for arm in self.arms:
-            moved = np.tile(_rest(arm), (len(values), 1))
-            for column, name in enumerate(arm.joints):
-                if name in self.joints:
-                    moved[:, column] = values[:, self.joints.index(name)]
-            frames.append(arm.poses(moved).matrix())
-        return np.stack(frames)
+        return np.stack(
+            [arm.poses(self.values_of(arm, values)).matrix() for arm in self.arms]
+        )
+
+    def values_of(self, arm: Arm, values: Array) -> Array:
+        """(n, j) values of the joints of a chain; those without values stand at rest."""
+        moved = np.tile(_rest(arm), (len(values), 1))
+        for column, name in enumerate(arm.joints):
+            if name in self.joints:
+                moved[:, column] = values[:, self.joints.index(name)]
+        return moved
 
 
 def robot_body(

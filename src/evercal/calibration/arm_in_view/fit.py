@@ -6,7 +6,7 @@ principal point, a common shift of all outlines outwards, and offsets of the joi
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -31,9 +31,10 @@ JOINTS = 10
 """Columns of the parameters; one for each joint value from `JOINTS` on."""
 LEAST_SCALE_PX = 0.3
 """Least robust standard deviation of the residuals."""
+LEAST_REPEATS = 2.0
+"""Least number of neighbouring residuals that err alike."""
 _LONGEST_STEP = 0.3
 """Metres or radians."""
-_RETRIES = 2
 
 
 @frozen_arrays
@@ -54,6 +55,30 @@ class Priors:
         pose = np.full(6, np.inf)
         shared = [self.focal, self.centre_px, self.centre_px, self.outline_px]
         return np.concatenate([pose, shared, self.joints])
+
+    def widened(self, fit: "ArmFit") -> Self:
+        """Priors of the size of their parameters, where that is larger.
+
+        The size of a kind is estimated as by D. MacKay, Bayesian interpolation, 1992.
+        """
+        variance = np.zeros(len(fit.free))
+        variance[fit.free] = np.diag(np.linalg.inv(fit.normal))
+        squares = fit.estimate.parameters**2 + variance
+        sizes = []
+        for column in (FOCAL, OUTLINE):
+            sizes.append(float(np.sqrt(squares[column])))
+        focal, outline = sizes
+        joints = self.joints
+        is_free = joints > 0
+        if is_free.any():
+            ratio = squares[JOINTS:][is_free] / joints[is_free] ** 2
+            joints = joints * max(1.0, float(np.sqrt(ratio.mean())))
+        return replace(
+            self,
+            focal=max(focal, self.focal),
+            outline_px=max(outline, self.outline_px),
+            joints=joints,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +133,8 @@ class ArmFit:
     """(m,) robust weights, 0 to 1."""
     scale_px: float
     """Robust standard deviation of the residuals."""
+    repeats: float
+    """Number of neighbouring residuals that err alike: their information counts once."""
     normal: Array
     """(p, p) normal matrix of the free parameters, with priors."""
     free: BoolArray
@@ -138,7 +165,11 @@ class Fitter:
         spacing_px: float,
         learn_at: Sequence[int] = (),
     ) -> ArmFit:
-        """Fit the outlines of images; the background is learned again in steps of `learn_at`."""
+        """Fit the outlines of images.
+
+        In the steps of `learn_at` the background is learned again; after them, priors become as
+        wide as the images ask for.
+        """
         estimate = start
         for number, reach in enumerate(reaches_px):
             frames = self._frames(estimate)
@@ -152,6 +183,8 @@ class Fitter:
             equations = _joined(rows)
             fit = solved(estimate, equations, priors)
             estimate = fit.estimate
+            if learn_at and number >= max(learn_at):
+                priors = priors.widened(fit)
         return fit
 
     def start(self, camera_from_base: SE3) -> Estimate:
@@ -228,7 +261,7 @@ class Fitter:
             own = [k for k, name in enumerate(arm.joints) if name in body.joints]
             if not own:
                 continue
-            motion = arm.slopes(body.arm_values(arm, values[None]))[0][:, own]
+            motion = arm.slopes(body.values_of(arm, values[None]))[0][:, own]
             turned = np.cross(motion[3:].T, points.on_link[rows][:, None])
             moved = (turned + motion[:3].T) @ links[number, :3, :3].T
             slopes[np.ix_(rows, JOINTS + np.array(columns))] = np.einsum(
@@ -268,14 +301,33 @@ def solved(estimate: Estimate, equations: Equations, priors: Priors) -> ArmFit:
     scale = max(LEAST_SCALE_PX, 1.4826 * float(np.median(np.abs(px))))
     weights = 1 / (1 + (px / (2 * scale)) ** 2) ** 2
     weighted = slopes * weights[:, None] / scale**2
+    information = weighted.T @ slopes
+    scatter = cluster_scatter(weighted * px[:, None], equations)
+    ridge = 1e-9 * np.diag(np.diag(information))
+    repeats = np.trace(np.linalg.solve(information + ridge, scatter)) / len(scatter)
+    repeats = max(LEAST_REPEATS, float(repeats))
     precision = 1 / sigma[free] ** 2
-    normal = weighted.T @ slopes + np.diag(precision)
-    right = weighted.T @ px - precision * estimate.parameters[free]
+    normal = information / repeats + np.diag(precision)
+    right = weighted.T @ px / repeats - precision * estimate.parameters[free]
     step = np.zeros(len(sigma))
     step[free] = np.linalg.solve(normal, right)
-    return ArmFit(
-        estimate.moved(step), equations, weights, scale, normal, free, priors
+    moved = estimate.moved(step)
+    return ArmFit(moved, equations, weights, scale, repeats, normal, free, priors)
+
+
+def cluster_scatter(gradients: Array, equations: Equations) -> Array:
+    """(p, p) covariance of the sum of gradients (m, p) of images, and of links."""
+    return _of_clusters(gradients, equations.image) + _of_clusters(
+        gradients, equations.link
     )
+
+
+def _of_clusters(gradients: Array, owners: IntArray) -> Array:
+    _, number = np.unique(owners, return_inverse=True)
+    sums = np.zeros((number.max() + 1, gradients.shape[1]))
+    np.add.at(sums, number, gradients)
+    sums -= sums.mean(0)
+    return sums.T @ sums * len(sums) / max(len(sums) - 1, 1)
 
 
 class TooFewPoints(ValueError):

@@ -7,21 +7,36 @@ import numpy as np
 
 from evercal.calibration.arm_in_view.fit import (
     ArmFit,
-    Estimate,
     Fitter,
     Priors,
     TooFewPoints,
 )
+from evercal.calibration.arm_in_view.result import (
+    LEAST_CONFIRMED,
+    calibration_of,
+    warnings_of,
+    with_verdict,
+)
 from evercal.calibration.arm_in_view.starts import Overlap, starts
 from evercal.calibration.arm_in_view.views import ArmViews
+from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
 from evercal.progress import OnProgress
-from evercal.typing import Array, IntArray
+from evercal.recordings.frame import Frame, Recording
+from evercal.robot.frame_names import FrameNames
+from evercal.robot.link_shapes import RobotBody, robot_body
+from evercal.robot.pose_errors import ArmErrors
+from evercal.robot.robot_model import RobotModel
+from evercal.typing import Array
 
+LEAST_IMAGES = 3
+"""Least number of images."""
+MOST_IMAGES = 40
+"""Images that are used; more of them are chosen by the motion of the joints."""
+_SLIDING_M = 0.5
+"""Offset of a sliding joint for a radian of others."""
 FIRST_STARTS = 4
 """Starts that are fitted; the others only if none of them is confirmed."""
-LEAST_CONFIRMED = 0.2
-"""Least share of the outline that the images show at the right pose."""
 SURE_CONFIRMED = 0.3
 """From here, no other start is tried."""
 SHORT_IMAGES = 10
@@ -34,18 +49,101 @@ _LEARN_AT = (0, 2, 4)
 _SPACING_PX = 4.0
 
 
-def fit_views(
-    views: ArmViews, priors: Priors, on_progress: OnProgress = lambda *_: None
-) -> ArmFit:
+def calibrate_arm_in_view(
+    recording: Recording,
+    model: RobotModel,
+    errors: ArmErrors | None = None,
+    without: Sequence[str] = (),
+    on_progress: OnProgress = lambda *_: None,
+) -> Calibration:
+    """Calibrate a fixed camera by the robot arm in its images.
+
+    Args:
+        recording: Images of the fixed camera with all joint values, see
+            `ReadOptions.whole_robot`; no start is needed.
+        model: The robot, with meshes or other visual geometry.
+        errors: What is known of the arm.
+        without: Links whose mesh is not what is mounted.
+        on_progress: Called with the current step, how much of it is done, and its total.
+
+    Returns:
+        base_from_camera, for the estimated intrinsics.
+
+    Raises:
+        InputError: The arm does not move, or is not recognised in the images.
+    """
+    frames = chosen_frames(recording)
+    assert recording.arm is not None, "chosen_frames requires joint values"
+    base = recording.frames.base or None
+    body = robot_body(model, recording.arm.joints, base, without)
+    fitter = Fitter(ArmViews.of(frames, body))
+    fit = fit_arm(fitter, priors_of(body, errors or ArmErrors()), on_progress)
+    names = FrameNames(body.base, "", recording.frames.camera)
+    calibration = calibration_of(fit, fitter, frames, names)
+    return with_verdict(calibration, warnings_of(fit, fitter))
+
+
+def chosen_frames(recording: Recording) -> list[Frame]:
+    """Frames with joint values, at most `MOST_IMAGES`, with the arm at places far apart."""
+    frames = [frame for frame in recording.train if frame.joints_rad is not None]
+    if recording.arm is None or not frames:
+        raise InputError(
+            f"{recording.name}: states no joint values; the arm in view needs those of each image:"
+            " joints.csv beside the images, or joint states in a bag"
+        )
+    if len(frames) < LEAST_IMAGES:
+        raise InputError(
+            f"{recording.name}: {len(frames)} images with joint values; the arm in view needs"
+            f" {LEAST_IMAGES} and more, with the arm at other places in each"
+        )
+    sizes = {(frame.camera.width, frame.camera.height) for frame in frames}
+    if len(sizes) > 1:
+        raise InputError(f"{recording.name}: its images differ in size; give one camera's")
+    values = np.array([frame.joints_rad for frame in frames])
+    return [frames[i] for i in far_apart(values, MOST_IMAGES)]
+
+
+def far_apart(values: Array, most: int) -> list[int]:
+    """Rows of (n, k) that are far from each other, in their order."""
+    chosen = [0]
+    distance = np.linalg.norm(values - values[0], axis=1)
+    while len(chosen) < min(most, len(values)):
+        chosen.append(int(distance.argmax()))
+        other = np.linalg.norm(values - values[chosen[-1]], axis=1)
+        distance = np.minimum(distance, other)
+    return sorted({*chosen})
+
+
+def priors_of(body: RobotBody, errors: ArmErrors) -> Priors:
+    """Priors of the offsets of joints; those of first joints turn the base, and stay 0."""
+    sigma = np.zeros(len(body.joints))
+    for arm in body.arms:
+        for joint in arm.chain[1:]:
+            name = arm.joints[joint.value]
+            if name in body.joints:
+                rad = errors.offset_rad(np.zeros((1, 6, 1)))
+                lever_m = 1.0 if joint.rotates else _SLIDING_M
+                sigma[body.joints.index(name)] = rad * lever_m
+    return Priors(joints=sigma)
+
+
+def fit_arm(fitter: Fitter, priors: Priors, on_progress: OnProgress) -> ArmFit:
     """Fit an arm to its views, without a start."""
-    fitter = Fitter(views)
+    views = fitter.views
     if not fitter.moving.any():
         raise InputError("the arm does not move; record it at poses far apart")
     zoom = max(views.size) / 640
     best = _best_start(fitter, priors, zoom, on_progress)
     every = range(len(views))
     reaches = [zoom * reach for reach in _FINAL_PX]
-    return fitter.fit(best.estimate, priors, every, reaches, _SPACING_PX, _LEARN_AT)
+    fit = fitter.fit(best.estimate, priors, every, reaches, _SPACING_PX, _LEARN_AT)
+    if fit.confirmed < LEAST_CONFIRMED:
+        raise InputError(
+            f"the images show {100 * fit.confirmed:.0f} % of the outline of the arm at the best"
+            f" pose, a right one shows {100 * LEAST_CONFIRMED:.0f} % and more; is this the URDF of"
+            " the robot, do the joint values belong to the images, and does the arm move most?"
+        )
+    return fit
 
 
 def _best_start(

@@ -34,6 +34,8 @@ class ArmViews:
     """(n, h, w) largest difference of the channels from the background."""
     known: BoolArray
     """(h, w) whether the background of a pixel is known."""
+    uncovered: BoolArray
+    """(h, w) pixels that the arm covers in no image, as far as its pose is known."""
     noise: float
     """Standard deviation of `difference` where nothing moves."""
 
@@ -46,6 +48,7 @@ class ArmViews:
         self.body = body
         self.values = values
         middle = np.median(images, 0)
+        self.uncovered = valid
         self._of_same_brightness(middle)
         self._set_background(middle.astype(np.float32), valid)
 
@@ -101,6 +104,7 @@ class ArmViews:
 
     def learn_background(self, covered: BoolArray) -> None:
         """Take the median of the images in which the arm does not cover a pixel, (n, h, w)."""
+        self.uncovered = self.valid & ~covered.any(0)
         count = (~covered).sum(0)
         some = covered.any(0) & (count > 0)
         colours = np.stack([self._corrected(i)[some] for i in range(len(self))])

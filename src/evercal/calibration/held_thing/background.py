@@ -8,7 +8,7 @@ import numpy as np
 from evercal.calibration.held_thing.moving_parts import MovingPart
 from evercal.recordings.frame import Frame
 from evercal.recordings.images import pixels_of
-from evercal.typing import Array, Image
+from evercal.typing import Array, BoolArray, Image
 
 POINTS = 400
 """Maximum number of points that are tracked."""
@@ -23,19 +23,25 @@ def background_motion(moving: Sequence[Frame]) -> Array:
 
     NaN where too few points are tracked, or move differently.
     """
-    motion = np.full((len(moving), 2), np.nan)
     first = moving[0]
     assert isinstance(first.image, MovingPart), "a frame of moving_parts"
-    grey = _grey(first)
-    still = (~first.image.moving).astype(np.uint8)
-    mask = cv2.erode(still, np.ones((9, 9), np.uint8))
+    motion = motion_of_still([*map(_grey, moving)], ~first.image.moving)
+    return motion / [first.camera.fx, first.camera.fy]
+
+
+def motion_of_still(greys: Sequence[Image], still: BoolArray) -> Array:
+    """(n, 2) pixels by which images in grey move where the first of them stands still (h, w).
+
+    NaN where too few points are tracked, or move differently.
+    """
+    motion = np.full((len(greys), 2), np.nan)
+    grey = greys[0]
+    mask = cv2.erode(still.astype(np.uint8), np.ones((9, 9), np.uint8))
     mask = cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
     points = cv2.goodFeaturesToTrack(grey, POINTS, 0.01, 8, mask=mask)
     if points is None or len(points) < LEAST_POINTS:
         return motion
-    focal = [first.camera.fx, first.camera.fy]
-    for i, frame in enumerate(moving):
-        other = _grey(frame)
+    for i, other in enumerate(greys):
         tracked, _, _ = cv2.calcOpticalFlowPyrLK(grey, other, points, points.copy())
         back, _, _ = cv2.calcOpticalFlowPyrLK(other, grey, tracked, points.copy())
         again = np.abs(back - points).max((1, 2)) < AGAIN_PX
@@ -44,7 +50,7 @@ def background_motion(moving: Sequence[Frame]) -> Array:
             continue
         middle = np.median(shift, 0)
         if np.median(np.abs(shift - middle)) < AGAIN_PX:
-            motion[i] = middle / focal
+            motion[i] = middle
     return motion
 
 

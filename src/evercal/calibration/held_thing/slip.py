@@ -63,7 +63,7 @@ def motion_warnings(
         if step is not None and (largest is None or step.share > largest.share):
             largest = step
             what = carrier
-    drift_deg = _range_deg(background)
+    drift_deg = drift_deg_of(background)
     if largest is not None:
         first = names[largest.before]
         if what == "the camera" and drift_deg < MOVED_DEG:
@@ -85,8 +85,11 @@ def motion_warnings(
     return ()
 
 
-def _range_deg(background: Array) -> float:
-    """Motion of the background between the halves that differ most; NaN if it is not known."""
+def drift_deg_of(background: Array) -> float:
+    """Motion of a background (n, 2), radians, between the halves that differ most, in degrees.
+
+    NaN if it is not known.
+    """
     known = background[np.isfinite(background).all(1)]
     if 2 * len(known) < len(background) or len(known) < 2 * LEAST_FRAMES:
         return np.nan

@@ -1,0 +1,176 @@
+"""From a fit of an arm to its `Calibration`: covariance, offsets, checks, and what is wrong."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from evercal.calibration.arm_in_view.covariance import halves, in_base, parts
+from evercal.calibration.arm_in_view.fit import FOCAL, JOINTS, ArmFit, Fitter
+from evercal.calibration.calibration import Calibration, ErrorTerm
+from evercal.calibration.checks import Checks
+from evercal.calibration.framed_pose import ImageUse, JointOffset
+from evercal.calibration.from_map.hand_eye import verdict_of
+from evercal.calibration.held_thing.background import motion_of_still
+from evercal.calibration.held_thing.slip import MOVED_DEG, drift_deg_of
+from evercal.geometry import length_mm_deg
+from evercal.recordings.frame import Frame
+from evercal.robot.frame_names import FrameNames
+from evercal.typing import Array
+
+LEAST_CONFIRMED = 0.2
+"""Least share of the outline that the images show at the right pose."""
+DOUBTFUL_CONFIRMED = 0.3
+"""Below it, there is a warning."""
+MOST_FOCAL = 0.015
+"""Change of the focal length above which the intrinsics are doubtful."""
+_HALVES_D2 = 12.6
+"""Squared distance of the halves above which the covariance is too small: 95 % are below."""
+_LINK_SHOWN = 0.4
+"""Least share of the outline of a link, of that of all links."""
+_LINK_POINTS = 40
+"""Least number of its points."""
+
+
+def calibration_of(
+    fit: ArmFit, fitter: Fitter, frames: Sequence[Frame], names: FrameNames
+) -> Calibration:
+    """The calibration of a camera whose frames (n,) were fitted."""
+    whole = parts(fit)
+    covariance = sum((part for part, _ in whole.values()), np.zeros(()))
+    of_pose = in_base(fit, covariance)
+    terms = [
+        ErrorTerm.of(name, in_base(fit, part), cause)
+        for name, (part, cause) in whole.items()
+    ]
+    apart = halves(fit)
+    # Halves differ by twice the error of the whole.
+    d2 = apart @ np.linalg.pinv(4 * _of_images(fit, whole)) @ apart
+    if d2 > _HALVES_D2:
+        added = of_pose * (d2 / _HALVES_D2 - 1)
+        of_pose = of_pose + added
+        terms.append(ErrorTerm.of("distance of halves of the images", added, "images"))
+    stated = frames[0].camera
+    estimated = stated.changed(fit.estimate.parameters[FOCAL : FOCAL + 3])
+    return Calibration(
+        "eye_to_hand",
+        fit.estimate.camera_from_base.inverse(),
+        of_pose,
+        frames=names,
+        camera=estimated,
+        lenses={"stated": stated, "estimated": estimated},
+        images=_uses(fit, frames),
+        error_terms=tuple(terms),
+        checks=_checks(fit, apart),
+        joints=_joints(fit, fitter, covariance),
+        joint_covariance=covariance[JOINTS:, JOINTS:],
+        source={"command": "arm-in-view", "frames": len(frames)},
+    )
+
+
+def with_verdict(calibration: Calibration, warnings: Sequence[str]) -> Calibration:
+    """The calibration with what the data contradict, and a verdict."""
+    checks = replace(calibration.checks, warnings=[*warnings])
+    calibration = replace(calibration, checks=checks)
+    return replace(calibration, verdict=verdict_of(calibration, warnings, ""))
+
+
+def _of_images(fit: ArmFit, whole: dict[str, tuple[Array, str]]) -> Array:
+    scatter, _ = whole["scatter of the outlines"]
+    return scatter[:6, :6]
+
+
+def _uses(fit: ArmFit, frames: Sequence[Frame]) -> tuple[ImageUse, ...]:
+    uses = []
+    equations = fit.equations
+    for i, frame in enumerate(frames):
+        rows = equations.image == i
+        name = frame.name
+        if not rows.any():
+            uses.append(ImageUse(name, False, "its outlines are not those of the arm"))
+            continue
+        px = float(np.median(np.abs(equations.px[rows])))
+        uses.append(ImageUse(name, True, "", px * _mm_per_px(fit)))
+    return tuple(uses)
+
+
+def _mm_per_px(fit: ArmFit) -> float:
+    """Millimetres at the arm that a pixel of the outline is."""
+    across = fit.equations.slopes[:, :2]
+    return 1000 / float(np.median(np.linalg.norm(across, axis=1)))
+
+
+def _checks(fit: ArmFit, apart: Array) -> Checks:
+    mm, deg = length_mm_deg(apart)
+    return Checks(
+        images_given=len(fit.equations.testable),
+        repeatability_mm=mm,
+        repeatability_deg=deg,
+        outline_confirmed=fit.confirmed,
+        outline_sigma_px=fit.scale_px,
+    )
+
+
+def _joints(
+    fit: ArmFit, fitter: Fitter, covariance: Array
+) -> tuple[JointOffset, ...]:
+    body = fitter.views.body
+    rotates = {}
+    for arm in body.arms:
+        rotates |= dict(zip(arm.joints, arm.rotates().tolist(), strict=True))
+    rows = []
+    for k, name in enumerate(body.joints):
+        why = ""
+        prior = fit.priors.joints[k]
+        sigma = float(np.sqrt(covariance[JOINTS + k, JOINTS + k]))
+        if not prior:
+            why = "its offset turns the frame of the base: a mark at its zero shows it"
+        elif sigma > 0.7 * prior:
+            why = f"move {name} and the joints after it more between the images"
+        offset = float(fit.estimate.offsets[k])
+        rows.append(JointOffset(name, offset, sigma, rotates.get(name, True), why))
+    return tuple(rows)
+
+
+def warnings_of(fit: ArmFit, fitter: Fitter) -> list[str]:
+    """What the images contradict, one sentence each."""
+    warnings = []
+    if fit.confirmed < DOUBTFUL_CONFIRMED:
+        warnings.append(
+            f"the images show {100 * fit.confirmed:.0f} % of the outline of the arm only: look at"
+            " the overlays, give more light, or take away what moves"
+        )
+    focal = float(np.expm1(fit.estimate.parameters[FOCAL]))
+    if abs(focal) > MOST_FOCAL:
+        warnings.append(
+            f"the images suggest a focal length {100 * focal:+.1f} % from the stated one:"
+            " calibrate the intrinsics first ('evercal detect' on images of a board)"
+        )
+    drift_deg = _drift_deg(fitter)
+    if drift_deg > MOVED_DEG:
+        warnings.append(
+            f"the background moves by {drift_deg:.2f} deg in the recording: fasten the camera and"
+            " record again"
+        )
+    return warnings
+
+
+def links_not_shown(fit: ArmFit, fitter: Fitter) -> list[str]:
+    """Names of links whose outlines the images do not show."""
+    links = fitter.views.body.links
+    testable = fit.equations.testable.sum(0)
+    shown = np.bincount(fit.equations.link, fit.weights, minlength=len(links))
+    is_lost = shown < _LINK_SHOWN * fit.confirmed * testable
+    is_lost &= testable >= _LINK_POINTS
+    return [links[k].link for k in np.flatnonzero(is_lost)]
+
+
+def _drift_deg(fitter: Fitter) -> float:
+    views = fitter.views
+    greys = [
+        np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+        for image in views.images
+    ]
+    motion = motion_of_still(greys, views.uncovered)
+    return drift_deg_of(motion / [views.camera.fx, views.camera.fy])

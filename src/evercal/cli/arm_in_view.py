@@ -1,0 +1,57 @@
+"""`evercal arm-in-view`."""
+
+from dataclasses import field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+from evercal.classes import frozen
+from evercal.cli import args
+from evercal.cli.calibrate import at_record, calibration_lines, joint_lines
+from evercal.cli.console import require_writable, say_notes
+from evercal.progress import Bars
+
+
+@frozen
+class ArmInView(args.Verb):
+    """Calibrate a fixed camera by the robot arm in its images; no board, nothing in the gripper.
+
+    The recording has images of the fixed camera and the joint values at each. The URDF with its
+    meshes says what the arm looks like. 10 images and more, with the arm at places far apart.
+
+    Example: evercal arm-in-view recording/ --urdf robot.urdf --out camera.json
+    """
+
+    writes = ("out",)
+    recording: Annotated[Positional[Path], args.shown("RECORDING")]
+    """Folder of images with joints.csv, or a bag with joint states."""
+    out: args.OutFile = Path("calibration.json")
+    """Output file."""
+    without: Annotated[tuple[str, ...], args.shown("LINK...")] = ()
+    """Links whose mesh is not what is mounted, such as another gripper."""
+    reading: args.HowRead = field(default_factory=args.Reading)
+    which: args.WhichArm = field(default_factory=args.ArmGiven)
+    at: args.At = None
+
+    def run(self) -> int:
+        require_writable(self.out, "--out")
+        point = args.Point.parse(self.at)
+        from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
+        from evercal.calibration.verdict import tier
+
+        recording = self.reading.whole_robot(self.recording)
+        say_notes(recording.notes)
+        start = f"{recording.name}: {len(recording.train)} images"
+        with Bars(self.log, start) as bars:
+            calibration = calibrate_arm_in_view(
+                recording, self.which.errors(), self.without, bars.step
+            )
+        calibration.write(self.out)
+        self.answer(
+            {**calibration.to_dict(), **at_record(calibration, point)},
+            *calibration_lines(calibration, point),
+            *joint_lines(calibration.joints, self.out),
+            then=args.next_words(calibration, self.out),
+        )
+        return 0 if tier(calibration) else 1
