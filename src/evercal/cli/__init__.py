@@ -35,6 +35,7 @@ VERBS = {
     "Calibrate": [
         "studio",
         "eye-to-hand",
+        "arm-in-view",
         "calibrate",
         "verify",
         "check",

@@ -189,13 +189,16 @@ class Reading(Named):
     every: Number = 1
     """Use every N-th image."""
 
-    def recording(self, path: Path, name: str | None = None) -> "Recording":
-        """Read the recording."""
+    def recording(
+        self, path: Path, name: str | None = None, whole_robot: bool = False
+    ) -> "Recording":
+        """Read the recording, with the values of all joints of a robot or of one arm."""
         from evercal.recordings import ReadOptions, load_recording
 
         options: dict[str, Any] = vars(self).copy()
         format = options.pop("format")
-        return load_recording(path, format, name, ReadOptions(**options))
+        given = ReadOptions(**options, whole_robot=whole_robot)
+        return load_recording(path, format, name, given)
 
     def words(self) -> list[str]:
         """The options that were given, as words of a command."""

@@ -39,13 +39,20 @@ class ArmInView(args.Verb):
         point = args.Point.parse(self.at)
         from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
         from evercal.calibration.verdict import tier
+        from evercal.recordings.formats.wrist import urdf_beside
+        from evercal.robot.robot_model import RobotModel
 
-        recording = self.reading.whole_robot(self.recording)
+        recording = self.reading.recording(self.recording, whole_robot=True)
         say_notes(recording.notes)
+        model = RobotModel(self.reading.urdf or urdf_beside(self.recording))
         start = f"{recording.name}: {len(recording.train)} images"
         with Bars(self.log, start) as bars:
             calibration = calibrate_arm_in_view(
-                recording, self.which.errors(), self.without, bars.step
+                recording,
+                model,
+                self.which.errors(),
+                self.without,
+                on_progress=bars.step,
             )
         calibration.write(self.out)
         self.answer(

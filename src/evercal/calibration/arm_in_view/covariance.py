@@ -44,7 +44,10 @@ def parts(fit: ArmFit) -> dict[str, tuple[Array, str]]:
         added = inverse @ np.diag(1 / own[free] ** 2) @ inverse
         found[name] = (_whole(added, free, count), cause)
     scatter = inverse @ _scatter(fit) @ inverse
-    return {"scatter of the outlines": (_whole(scatter, free, count), "images"), **found}
+    return {
+        "scatter of the outlines": (_whole(scatter, free, count), "images"),
+        **found,
+    }
 
 
 def in_base(fit: ArmFit, covariance: Array) -> Array:

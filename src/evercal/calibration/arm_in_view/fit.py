@@ -41,9 +41,9 @@ _LONGEST_STEP = 0.3
 class Priors:
     """Standard deviations of the parameters before the images."""
 
-    focal: float = 0.005
+    focal: float = 0.001
     """Of the logarithm of the focal length."""
-    centre_px: float = 1.0
+    centre_px: float = 0.5
     """Of the principal point."""
     outline_px: float = 0.25
     """Of a common shift of all outlines: light, blur, simplified meshes."""
@@ -257,7 +257,9 @@ class Fitter:
         for number in np.unique(points.link):
             rows = points.link == number
             arm = body.arms[number]
-            columns = [body.joints.index(name) for name in arm.joints if name in body.joints]
+            columns = [
+                body.joints.index(name) for name in arm.joints if name in body.joints
+            ]
             own = [k for k, name in enumerate(arm.joints) if name in body.joints]
             if not own:
                 continue

@@ -22,6 +22,12 @@ _CONTRAST = 6.0
 """Differences from the background that are this many times the noise are the arm."""
 _AROUND = 4.0
 """Length of the sides of an outline that are compared, pixels."""
+_FINE_PX = 6.0
+"""Up to this search distance, outlines are where intensities change most."""
+_SIDE = 2.0
+"""Length of the sides whose intensities are compared, pixels; hands of small arms are thin."""
+_BLURRED = 1.0
+"""Half of the width of a blurred edge, pixels."""
 _INSIDE = 0.2
 """Least mean of the likeness of the inner side to the arm, -1 to 1."""
 _OUTSIDE = -0.5
@@ -149,43 +155,86 @@ class Offsets(NamedTuple):
     """(m,) whether the image shows the end of the arm there."""
     testable: BoolArray
     """(m,) whether the background beside it is known."""
+    contrast: Array
+    """(m,) how much brighter the arm is than the background, -1 to 1."""
 
 
 def image_offsets(
     views: ArmViews, i: int, points: OutlinePoints, reach_px: float
 ) -> Offsets:
     """Find where image `i` ends to differ from the background, along the normals of points."""
-    step = 1.0 if reach_px > 6 else 0.5
+    step = 1.0 if reach_px > _FINE_PX else 0.5
     end = reach_px + _AROUND
     along = np.arange(-end, end + step / 2, step)
     grid = points.pixels[:, None] + along[:, None] * points.normals[:, None]
     differs = _sampled_at(views.difference[i], grid)
     known = _sampled_at(views.known.astype(np.float32), grid) > 0.99
     like = np.clip(differs / (_CONTRAST * views.noise) - 1, -1, 1) * known
+    near = round(_AROUND / step)
+    signed = _sampled_at(views.signed(i), grid)
     # The best end of the arm: like it before, unlike it after.
     total = np.cumsum(like, 1)
     score = 2 * total - total[:, -1:]
-    score[:, np.abs(along) > reach_px] = -np.inf
-    best = score.argmax(1)
-    near = round(_AROUND / step)
+    best = _best(score, along, reach_px)
+    side = round(_SIDE / step)
+    if reach_px <= _FINE_PX:
+        centre = np.searchsorted(along, 0.0)
+        profile, _ = _profile(signed, np.full(len(grid), centre), side)
+        best = _best(_steps(profile, side), along, reach_px)
+    profile, sign = _profile(signed, best, side)
     window = best[:, None] + np.arange(-near, near + 1)
     window = np.clip(window, 0, len(along) - 1)
     around = np.take_along_axis(like, window, 1)
-    before = np.take_along_axis(differs, window[:, :near], 1)
-    crossing = _crossing(differs, best, np.median(before, 1) / 2)
+    beside = np.take_along_axis(profile, window, 1)
+    inside = beside[:, near - side - 1 : near - 1].mean(1)
+    outside = beside[:, near + 2 : near + side + 2].mean(1)
+    crossing = _crossing(profile, best, (inside + outside) / 2)
     px = along[0] + step * crossing
     confirmed = np.isfinite(px) & (np.abs(px) <= reach_px)
-    confirmed &= around[:, :near].mean(1) > _INSIDE
-    confirmed &= around[:, near + 1 :].mean(1) < _OUTSIDE
+    blurred = round(_BLURRED / step)
+    confirmed &= around[:, : near - blurred].mean(1) > _INSIDE
+    confirmed &= around[:, near + blurred + 1 :].mean(1) < _OUTSIDE
     testable = known[:, np.abs(along) <= _AROUND].all(1)
-    return Offsets(np.where(confirmed, px, 0.0), confirmed, testable)
+    contrast = sign * inside / 255
+    return Offsets(np.where(confirmed, px, 0.0), confirmed, testable, contrast)
+
+
+def _best(score: Array, along: Array, reach_px: float) -> IntArray:
+    """(m,) sample with the largest score (m, k) within reach."""
+    return np.where(np.abs(along) <= reach_px, score, -np.inf).argmax(1)
+
+
+def _profile(
+    signed: Float32Array, end: IntArray, near: int
+) -> tuple[Float32Array, Array]:
+    """(m, k) differences in the channel of (m, k, 3) that differs most, and (m,) its sign.
+
+    The arm is in the `near` samples before its end (m,); there they are made positive.
+    """
+    inside = np.clip(end[:, None] - 1 - np.arange(near), 0, signed.shape[1] - 1)
+    within = np.take_along_axis(signed, inside[..., None], 1).mean(1)
+    channel = np.abs(within).argmax(1)[:, None]
+    sign = np.sign(np.take_along_axis(within, channel, 1))
+    profile = np.take_along_axis(signed, channel[:, None], 2)[..., 0] * sign
+    return profile, sign[:, 0]
+
+
+def _steps(profile: Float32Array, near: int) -> Array:
+    """(m, k) mean of `near` samples before each, minus that of as many after it."""
+    total = np.cumsum(profile, 1, dtype=float)
+    total = np.pad(total, ((0, 0), (near + 1, near)), mode="edge")
+    total[:, : near + 1] = 0
+    count = profile.shape[1]
+    before = total[:, near : near + count] - total[:, :count]
+    after = total[:, 2 * near + 1 :][:, :count] - total[:, near + 1 :][:, :count]
+    return (before - after) / near
 
 
 def _crossing(differs: Float32Array, best: IntArray, level: Array) -> Array:
-    """(m,) place between samples near `best` at which `differs` falls below a level, or NaN."""
+    """(m,) place nearest to `best` at which `differs` falls below a level, or NaN."""
     rows = np.arange(len(best))
     place = np.full(len(best), np.nan)
-    for k in range(-2, 3):
+    for k in (0, -1, 1, -2, 2, -3):
         a = np.clip(best + k, 0, differs.shape[1] - 2)
         high = differs[rows, a]
         low = differs[rows, a + 1]

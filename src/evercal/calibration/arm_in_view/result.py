@@ -112,9 +112,7 @@ def _checks(fit: ArmFit, apart: Array) -> Checks:
     )
 
 
-def _joints(
-    fit: ArmFit, fitter: Fitter, covariance: Array
-) -> tuple[JointOffset, ...]:
+def _joints(fit: ArmFit, fitter: Fitter, covariance: Array) -> tuple[JointOffset, ...]:
     body = fitter.views.body
     rotates = {}
     for arm in body.arms:

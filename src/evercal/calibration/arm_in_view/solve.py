@@ -21,6 +21,7 @@ from evercal.calibration.arm_in_view.starts import Overlap, starts
 from evercal.calibration.arm_in_view.views import ArmViews
 from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
+from evercal.geometry import SE3
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, Recording
 from evercal.robot.frame_names import FrameNames
@@ -29,6 +30,10 @@ from evercal.robot.pose_errors import ArmErrors
 from evercal.robot.robot_model import RobotModel
 from evercal.typing import Array
 
+NOT_RECOGNISED = (
+    "the arm was not recognised in the images: is this the URDF of the robot, and are these its"
+    " joint values?"
+)
 LEAST_IMAGES = 3
 """Least number of images."""
 MOST_IMAGES = 40
@@ -54,6 +59,7 @@ def calibrate_arm_in_view(
     model: RobotModel,
     errors: ArmErrors | None = None,
     without: Sequence[str] = (),
+    start: SE3 | None = None,
     on_progress: OnProgress = lambda *_: None,
 ) -> Calibration:
     """Calibrate a fixed camera by the robot arm in its images.
@@ -64,6 +70,7 @@ def calibrate_arm_in_view(
         model: The robot, with meshes or other visual geometry.
         errors: What is known of the arm.
         without: Links whose mesh is not what is mounted.
+        start: base_from_camera to start from, right to some pixels; if omitted, it is searched.
         on_progress: Called with the current step, how much of it is done, and its total.
 
     Returns:
@@ -77,7 +84,8 @@ def calibrate_arm_in_view(
     base = recording.frames.base or None
     body = robot_body(model, recording.arm.joints, base, without)
     fitter = Fitter(ArmViews.of(frames, body))
-    fit = fit_arm(fitter, priors_of(body, errors or ArmErrors()), on_progress)
+    priors = priors_of(body, errors or ArmErrors())
+    fit = fit_arm(fitter, priors, start, on_progress)
     names = FrameNames(body.base, "", recording.frames.camera)
     calibration = calibration_of(fit, fitter, frames, names)
     return with_verdict(calibration, warnings_of(fit, fitter))
@@ -98,7 +106,9 @@ def chosen_frames(recording: Recording) -> list[Frame]:
         )
     sizes = {(frame.camera.width, frame.camera.height) for frame in frames}
     if len(sizes) > 1:
-        raise InputError(f"{recording.name}: its images differ in size; give one camera's")
+        raise InputError(
+            f"{recording.name}: its images differ in size; give one camera's"
+        )
     values = np.array([frame.joints_rad for frame in frames])
     return [frames[i] for i in far_apart(values, MOST_IMAGES)]
 
@@ -127,16 +137,31 @@ def priors_of(body: RobotBody, errors: ArmErrors) -> Priors:
     return Priors(joints=sigma)
 
 
-def fit_arm(fitter: Fitter, priors: Priors, on_progress: OnProgress) -> ArmFit:
-    """Fit an arm to its views, without a start."""
+def fit_arm(
+    fitter: Fitter,
+    priors: Priors,
+    start: SE3 | None = None,
+    on_progress: OnProgress = lambda *_: None,
+) -> ArmFit:
+    """Fit an arm to its views, from base_from_camera or without a start.
+
+    Raises:
+        InputError: The arm does not move, or the images do not show it where it should be.
+    """
     views = fitter.views
     if not fitter.moving.any():
         raise InputError("the arm does not move; record it at poses far apart")
     zoom = max(views.size) / 640
-    best = _best_start(fitter, priors, zoom, on_progress)
+    if start is None:
+        best = _best_start(fitter, priors, zoom, on_progress).estimate
+    else:
+        best = fitter.start(start.inverse())
     every = range(len(views))
     reaches = [zoom * reach for reach in _FINAL_PX]
-    fit = fitter.fit(best.estimate, priors, every, reaches, _SPACING_PX, _LEARN_AT)
+    try:
+        fit = fitter.fit(best, priors, every, reaches, _SPACING_PX, _LEARN_AT)
+    except TooFewPoints:
+        raise InputError(NOT_RECOGNISED) from None
     if fit.confirmed < LEAST_CONFIRMED:
         raise InputError(
             f"the images show {100 * fit.confirmed:.0f} % of the outline of the arm at the best"
@@ -152,7 +177,9 @@ def _best_start(
     views = fitter.views
     overlap = Overlap(views, fitter.moving)
     poses = starts(overlap, reach_of(fitter))
-    pose_only = replace(priors, focal=0, centre_px=0, outline_px=0, joints=0 * priors.joints)
+    pose_only = replace(
+        priors, focal=0, centre_px=0, outline_px=0, joints=0 * priors.joints
+    )
     few = np.linspace(0, len(views) - 1, min(SHORT_IMAGES, len(views)))
     few = np.unique(few.round().astype(int))
     reaches = [zoom * reach for reach in _SHORT_PX]
@@ -170,10 +197,7 @@ def _best_start(
         if best is None or fit.confirmed > best.confirmed:
             best = fit
     if best is None:
-        raise InputError(
-            "the arm was not recognised in the images: is this the URDF of the robot, and are"
-            " these its joint values?"
-        )
+        raise InputError(NOT_RECOGNISED)
     return best
 
 

@@ -40,7 +40,12 @@ class ArmViews:
     """Standard deviation of `difference` where nothing moves."""
 
     def __init__(
-        self, images: Image, valid: BoolArray, camera: Camera, body: RobotBody, values: Array
+        self,
+        images: Image,
+        valid: BoolArray,
+        camera: Camera,
+        body: RobotBody,
+        values: Array,
     ) -> None:
         self.images = images
         self.valid = valid
@@ -91,6 +96,10 @@ class ArmViews:
 
     def _corrected(self, i: int) -> Float32Array:
         return self.images[i] * self._gains[i]
+
+    def signed(self, i: int) -> Float32Array:
+        """(h, w, 3) image `i`, at the brightness of the background, minus the background."""
+        return self._corrected(i) - self._background
 
     def _set_background(self, background: Float32Array, known: BoolArray) -> None:
         self._background = background

@@ -180,7 +180,7 @@ def _rows(
     root: Path, file: Path, options: ReadOptions, convention: str | None
 ) -> tuple[RobotPoses, list[str]]:
     if file.name in _JOINTS:
-        model = robot_of(options.urdf or _urdf(root, file), options)
+        model = robot_of(options.urdf or urdf_beside(root), options)
         links = options.base_frame, options.gripper_frame
         return read_joint_poses(file, model, *links, options.pose_convention)
     if file.name.startswith("metadata"):
@@ -201,12 +201,13 @@ def _rows(
     return poses, []
 
 
-def _urdf(root: Path, joints: Path) -> Path:
+def urdf_beside(root: Path) -> Path:
+    """The only URDF of a folder of joint angles."""
     files = files_in(root, (".urdf",))
     if len(files) != 1:
         number = f"{len(files)} URDF files" if files else "no URDF"
         raise InputError(
-            f"{root}: {joints.name} needs a URDF, {number} is beside it; give `urdf`"
+            f"{root}: joint angles need a URDF, {number} is beside them; give `urdf`"
         )
     return files[0]
 

@@ -1,0 +1,55 @@
+"""A fixed camera by an arm of boxes in its images."""
+
+from pathlib import Path
+
+import pytest
+
+from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
+from evercal.calibration.calibration import Calibration
+from evercal.errors import InputError
+from evercal.geometry import pose_distance_mm_deg
+from evercal.recordings import ReadOptions, load_recording
+from evercal.robot.robot_model import RobotModel
+from tests import arm_cell
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("arm")
+    arm_cell.write(folder)
+    return folder
+
+
+def _calibrated(folder: Path) -> Calibration:
+    recording = load_recording(folder, None, None, ReadOptions(whole_robot=True))
+    return calibrate_arm_in_view(recording, RobotModel(folder / "robot.urdf"))
+
+
+def test_the_camera_is_estimated_without_a_start(cell: Path) -> None:
+    """0.3 mm and 0.011 deg, from ten images of 320x240 at 1.4 m."""
+    calibration = _calibrated(cell)
+    mm, deg = pose_distance_mm_deg(
+        calibration.parent_from_child, arm_cell.BASE_FROM_CAMERA
+    )
+    assert mm < 1.5
+    assert deg < 0.06
+    assert (
+        calibration.uncertain_pose.squared_mahalanobis(arm_cell.BASE_FROM_CAMERA) < 17
+    )
+    assert calibration.sigma_mm < 4
+
+
+def test_joint_values_of_other_images_are_refused(cell: Path, tmp_path: Path) -> None:
+    """The arm is not where the values say."""
+    folder = tmp_path / "shuffled"
+    folder.mkdir()
+    for file in cell.iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    header, *rows = (cell / "joints.csv").read_text().splitlines()
+    names = [row.partition(",")[0] for row in rows]
+    others = rows[3:] + rows[:3]
+    values = [row.partition(",")[2] for row in others]
+    mixed = [f"{name},{value}" for name, value in zip(names, values, strict=True)]
+    (folder / "joints.csv").write_text("\n".join([header, *mixed]))
+    with pytest.raises(InputError, match="do the joint values belong"):
+        _calibrated(folder)
