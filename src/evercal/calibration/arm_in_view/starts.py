@@ -8,7 +8,6 @@ import numpy as np
 
 from evercal.calibration.arm_in_view.views import ArmViews
 from evercal.geometry import SE3, Camera, norms, unit_vectors
-from evercal.robot.link_shapes import RobotBody
 from evercal.typing import Array, BoolArray, Float32Array, Image, IntArray
 
 WIDTH_PX = 80
