@@ -1,7 +1,7 @@
 """The pose of a camera by the outlines of an arm: robust Gauss-Newton, drawn anew in each step.
 
-Beside the pose it estimates what all images share and may be wrong, each with a prior: focal length,
-principal point, a common shift of all outlines outwards, and offsets of the joints.
+Beside the pose it estimates what all images share and may be wrong, each with a prior: focal
+length, principal point, a common shift of all outlines outwards, and offsets of the joints.
 """
 
 from collections.abc import Sequence
