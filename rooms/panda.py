@@ -17,7 +17,7 @@ from rooms.items import Parts
 from rooms.materials import Material, plain
 from rooms.shapes import Mesh
 
-_MESHES = "share/example-robot-data/robots/panda_description/meshes/visual"
+_ROBOTS = "share/example-robot-data/robots"
 
 
 def panda_meshes(joints_rad: np.ndarray, opening_m: float = 0.03) -> Parts:
@@ -67,7 +67,8 @@ def _link_meshes(link: str) -> Parts:
         import trimesh  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise InputError(_missing(error.name)) from None
-    scene = trimesh.load_scene(_folder() / f"{link}.dae")
+    folder = robots_folder() / "panda_description/meshes/visual"
+    scene = trimesh.load_scene(folder / f"{link}.dae")
     parts = []
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
@@ -86,11 +87,12 @@ def _link_meshes(link: str) -> Parts:
     return parts
 
 
-def _folder() -> Path:
+def robots_folder() -> Path:
+    """Folder of the robots of the package `example-robot-data`."""
     for entry in sys.path:
         for prefix in ("cmeel.prefix", "."):
-            folder = Path(entry) / prefix / _MESHES
-            if (folder / "link0.dae").is_file():
+            folder = Path(entry) / prefix / _ROBOTS
+            if folder.is_dir():
                 return folder
     raise InputError(_missing("example-robot-data"))
 

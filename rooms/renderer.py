@@ -272,6 +272,13 @@ def _encode(radiance: np.ndarray, noise: float, rng: np.random.Generator) -> np.
     knee = 0.7
     over = np.maximum(radiance - knee, 0.0)
     linear = np.minimum(radiance, knee) + (1 - knee) * (1 - np.exp(-over / (1 - knee)))
+    return sensor_bytes(linear, noise, rng)
+
+
+def sensor_bytes(
+    linear: np.ndarray, noise: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Linear light in [0, 1] to sRGB bytes with sensor noise, see `RenderOptions`."""
     if noise > 0:  # shot noise grows with the square root of the light
         sigma = noise * np.sqrt(np.clip(linear, 0.01, 1.0) / 0.2)
         linear = linear + sigma * rng.standard_normal(linear.shape)

@@ -14,8 +14,7 @@ pytest.importorskip("collada", reason="pycollada is not installed")
 
 
 def test_meshes_and_flange_are_where_the_urdf_has_them() -> None:
-    meshes = panda._folder()
-    robot = meshes.parents[1]
+    robot = panda.robots_folder() / "panda_description"
 
     def on_disk(fname: str) -> str:
         return str(robot / fname.rpartition("panda_description/")[2])
