@@ -110,7 +110,7 @@ def _rasterized(
     before = cv2.resize(
         stage.depth[window], (width, height), interpolation=cv2.INTER_NEAREST
     )
-    seen = (depth < _FAR_M) & ((depth < before) | (before == 0))
+    seen = (depth < 0.99 * _FAR_M) & ((depth < before) | (before == 0))
     fine[~seen] = 0
     shrunk = tuple((high - low).tolist())
     area = cv2.INTER_AREA
