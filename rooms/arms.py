@@ -32,15 +32,13 @@ _SAMPLES = 4
 """Light paths per pixel."""
 _NOISE = 0.012
 """Sensor noise, see `RenderOptions`."""
-_TABLE_M = (-0.45, 1.05, 0.475)
-"""Ends along x and half width of the robot's table in the base frame, see `rooms.room`."""
 
 
 class ArmKind(NamedTuple):
     """An arm of `example-robot-data`."""
 
     urdf: str
-    """File below the robots of the package."""
+    """File below the robots of the package, or a path."""
     joints: tuple[str, ...]
     low: tuple[float, ...]
     """Lowest drawn value of each joint, radians, or metres of sliding joints."""
@@ -63,6 +61,56 @@ ARMS = {
         "panda_hand_tcp",
         (0.2, 0.0, 0.45),
         0.6,
+    ),
+    "ur5": ArmKind(
+        "ur_description/urdf/ur5_robot.urdf",
+        (
+            "shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint",
+            "wrist_2_joint", "wrist_3_joint",
+        ),
+        (-2.0, -2.3, -2.2, -2.8, -2.5, -2.5),
+        (2.0, -0.5, 2.2, 1.0, 2.5, 2.5),
+        "tool0",
+        (0.1, 0.0, 0.45),
+        0.65,
+    ),
+    "xarm7": ArmKind(
+        "xarm_description/urdf/xarm7.urdf",
+        tuple(f"joint{i}" for i in range(1, 8)),
+        (-2.0, -1.2, -1.5, 0.2, -2.0, -1.2, -2.5),
+        (2.0, 1.2, 1.5, 2.6, 2.0, 2.2, 2.5),
+        "link_eef",
+        (0.1, 0.0, 0.4),
+        0.55,
+    ),
+    "so101": ArmKind(
+        "so_arm_description/urdf/so101.urdf",
+        (
+            "shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper",
+        ),
+        (-1.7, -1.6, -1.5, -1.5, -2.5, 0.0),
+        (1.7, 1.3, 1.6, 1.5, 2.5, 1.5),
+        "gripper_frame_link",
+        (0.12, 0.0, 0.18),
+        0.25,
+    ),
+    "kinova": ArmKind(
+        "kinova_description/robots/kinova.urdf",
+        tuple(f"j2s6s200_joint_{i}" for i in range(1, 7)),
+        (-2.0, 1.6, 0.7, -2.0, 0.7, -2.5),
+        (2.0, 4.6, 5.6, 2.0, 5.5, 2.5),
+        "j2s6s200_end_effector",
+        (0.1, 0.0, 0.45),
+        0.6,
+    ),
+    "scara": ArmKind(
+        str(Path(__file__).with_name("scara.urdf")),
+        ("turn_1", "turn_2", "slide", "turn_3"),
+        (-1.9, -2.2, -0.12, -3.0),
+        (1.9, 2.2, 0.1, 3.0),
+        "tool",
+        (0.2, 0.0, 0.3),
+        0.4,
     ),
 }
 
@@ -252,7 +300,7 @@ def _motion(
             return None
         joints = rng.uniform(body.kind.low, body.kind.high)
         points = body.points(joints)
-        if not _possible(points, scene):
+        if not _possible(points, scene, body.kind.reach_m):
             continue
         seen = base_from_camera.inverse().apply(points)
         away = np.linalg.norm(seen, axis=1).min()
@@ -267,16 +315,17 @@ def _motion(
     return None
 
 
-def _possible(points: np.ndarray, scene: Room) -> bool:
+def _possible(points: np.ndarray, scene: Room, reach_m: float) -> bool:
     """Whether an arm along points is above its table, free, and not in its own way."""
     half = len(points) // 2
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    along = np.append(0, np.cumsum(steps))
-    far = np.abs(along[:, None] - along) > 0.4
+    last = points[half:]
+    unit = reach_m / 0.6
+    along = np.append(0, np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum())
+    far = np.abs(along[:, None] - along) > 0.4 * unit
     apart = np.linalg.norm(points[:, None] - points, axis=-1)
-    column = np.hypot(*points[half:, :2].T) + np.maximum(0, points[half:, 2] - 0.4)
-    if points[half:, 2].min() < 0.09 or column.min() < 0.2:
+    column = np.hypot(*last[:, :2].T) + np.maximum(0, last[:, 2] - 0.4 * unit)
+    if last[:, 2].min() < 0.09 * unit or column.min() < 0.2 * unit:
         return False
-    if apart[far].min(initial=1) < 0.15:
+    if apart[far].min(initial=1) < 0.15 * unit:
         return False
-    return bool(scene.is_free(points[half // 2 :], 0.05).all())
+    return bool(scene.is_free(points[half // 2 :], 0.05 * unit).all())
