@@ -22,6 +22,10 @@ VERBS = {
         "eye_to_hand",
         "a fixed camera and a textured thing in the gripper",
     ),
+    "arm-in-view": (
+        "arm_in_view",
+        "a fixed camera and the arm in its images, also with what goes wrong",
+    ),
     "trust": (
         "trust",
         "other cameras, few images, an inaccurate arm: errors and deviations",

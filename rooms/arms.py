@@ -22,6 +22,8 @@ from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.robot.robot_model import RobotModel
 from evercal.simulation.box_room import look_at
 from evercal.storage import write_bytes, write_json
+from rooms.arm_shapes import ArmShapes
+from rooms.drawn_arms import Stage, draw
 from rooms.panda import panda_meshes, robots_folder
 from rooms.renderer import Renderer, RenderOptions
 from rooms.room import KINDS, RESERVED, Room, room
@@ -128,12 +130,16 @@ class Setting:
     size: tuple[int, int] = (640, 480)
     """Width and height of an image, pixels."""
     images: int = 25
+    drawn: bool = False
+    """Draw the arm into one picture of the room, see `rooms.drawn_arms`; arms other than the
+    Panda are always drawn."""
 
     @property
     def name(self) -> str:
         """Folder of the recording."""
         size = "x".join(map(str, self.size))
-        return f"{self.arm}-{self.distance_m:g}-{size}-{self.seed}"
+        arm = f"drawn-{self.arm}" if self.drawn or self.arm != "panda" else self.arm
+        return f"{arm}-{self.distance_m:g}-{size}-{self.seed}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +171,10 @@ def render(setting: Setting, out: Path) -> Iterator[int]:
     plan = make_plan(setting)
     folder = root / "recording"
     folder.mkdir(parents=True, exist_ok=True)
-    yield from _render_images(setting, plan, folder)
+    if setting.name.startswith("drawn"):
+        yield from _draw_images(setting, plan, folder)
+    else:
+        yield from _render_images(setting, plan, folder)
     write_recording(setting, plan, root)
 
 
@@ -212,6 +221,24 @@ def _render_images(setting: Setting, plan: Plan, folder: Path) -> Iterator[int]:
         seed = int(np.random.default_rng([setting.seed, i, 41]).integers(2**31))
         rgb = renderer.render(plan.camera, plan.base_from_camera, options, seed)
         write_bytes(path, cv2.imencode(".png", rgb[..., ::-1])[1].tobytes())
+        yield i
+
+
+def _draw_images(setting: Setting, plan: Plan, folder: Path) -> Iterator[int]:
+    renderer = Renderer(plan.room.meshes())
+    options = RenderOptions(samples=_SAMPLES)
+    rgb = renderer.render(plan.camera, plan.base_from_camera, options, setting.seed)
+    depth = renderer.depth(plan.camera, plan.base_from_camera)
+    rng = np.random.default_rng([setting.seed, 43])
+    light = rng.uniform((-1.2, -1.2, 1.3), (1.2, 1.2, 1.7))
+    stage = Stage(plan.camera, plan.base_from_camera, rgb, depth, light)
+    shapes = ArmShapes(urdf_of(setting.arm), ARMS[setting.arm].joints)
+    for i in range(setting.images):
+        path = folder / f"{i:03d}.png"
+        if not path.exists():
+            rng = np.random.default_rng([setting.seed, i, 44])
+            image = draw(shapes, plan.joints[i], stage, rng, _NOISE)
+            write_bytes(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())
         yield i
 
 

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from evercal.geometry import SE3, Camera
-from rooms.arm_shapes import ArmShapes
+from evercal.simulation.box_room import look_at
+from rooms.arm_shapes import ArmShapes, Part
 from rooms.renderer import sensor_bytes
 
 _FINER = 4
@@ -42,7 +43,7 @@ def draw(
     noise: float = 0.012,
 ) -> np.ndarray:
     """Draw an arm with joint values (k,) into a room; sRGB (H, W, 3) uint8."""
-    vertices, normals, faces, colours = _meshes_at(shapes, joints)
+    vertices, normals, faces, colours = _meshes_at(shapes.parts, shapes, joints)
     shade = _shade(vertices, normals, stage.light_m) * colours
     camera_from_base = stage.base_from_camera.inverse()
     colour, cover = _rasterized(stage, camera_from_base.apply(vertices), faces, shade)
@@ -59,18 +60,33 @@ def linear_light(rgb: np.ndarray) -> np.ndarray:
     return curve.astype(np.float32)[rgb]
 
 
+def draw_beside(
+    rgb: np.ndarray, shapes: ArmShapes, joints: np.ndarray, added: Part, stage: Stage
+) -> np.ndarray:
+    """Draw one more part onto an image (H, W, 3) that shows the arm, hidden by the arm."""
+    vertices, normals, faces, colours = _meshes_at([added, *shapes.parts], shapes, joints)
+    shade = _shade(vertices, normals, stage.light_m) * colours
+    shade[len(added.vertices_m) :] = -1.0
+    seen = stage.base_from_camera.inverse().apply(vertices)
+    colour, cover = _rasterized(stage, seen, faces, shade)
+    mixed = colour + (1 - cover[..., None]) * linear_light(rgb)
+    return sensor_bytes(mixed, 0.0, np.random.default_rng(0))
+
+
 def coverage(shapes: ArmShapes, joints: np.ndarray, stage: Stage) -> np.ndarray:
     """(H, W) share of each pixel that an arm covers."""
-    vertices, _, faces, colours = _meshes_at(shapes, joints)
+    vertices, _, faces, colours = _meshes_at(shapes.parts, shapes, joints)
     seen = stage.base_from_camera.inverse().apply(vertices)
     return _rasterized(stage, seen, faces, colours)[1]
 
 
-def _meshes_at(shapes: ArmShapes, joints: np.ndarray) -> tuple[np.ndarray, ...]:
+def _meshes_at(
+    parts: list[Part], shapes: ArmShapes, joints: np.ndarray
+) -> tuple[np.ndarray, ...]:
     frames = shapes.frames(joints)
     vertices, normals, faces, colours = [], [], [], []
     first = 0
-    for part in shapes.parts:
+    for part in parts:
         frame = frames[part.link]
         vertices.append(part.vertices_m @ frame[:3, :3].T + frame[:3, 3])
         normals.append(part.normals @ frame[:3, :3].T)
@@ -111,6 +127,7 @@ def _rasterized(
         stage.depth[window], (width, height), interpolation=cv2.INTER_NEAREST
     )
     seen = (depth < 0.99 * _FAR_M) & ((depth < before) | (before == 0))
+    seen &= fine[..., 0] >= 0
     fine[~seen] = 0
     shrunk = tuple((high - low).tolist())
     area = cv2.INTER_AREA
@@ -186,6 +203,4 @@ def _shadow(stage: Stage, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray
 
 def looking(eye: np.ndarray, target: np.ndarray) -> SE3:
     """base_from_camera of a camera that looks from a point to another."""
-    from evercal.simulation.box_room import look_at
-
     return look_at(eye, target + np.array([1e-4, 0, 0]))
