@@ -184,7 +184,8 @@ def _measured(condition: Condition, root: Path, seed: int) -> Row:
         began = time.process_time()
         try:
             model = RobotModel(recording / "robot.urdf")
-            answer = calibrate_arm_in_view(load_recording(recording, options), model)
+            loaded = load_recording(recording, options=options)
+            answer = calibrate_arm_in_view(loaded, model)
         except InputError as error:
             seconds = time.process_time() - began
             return {"refused": str(error), "seconds": seconds}
