@@ -139,7 +139,7 @@ def _other_robot(cell: Cell, _: float, __: Generator) -> None:
 
 
 def _bump(cell: Cell, px: float, rng: Generator) -> None:
-    axis = rng.normal(size=3)
+    axis = rng.normal(size=3) * (1, 1, 0.3)
     axis *= px / cell.camera.fx / np.linalg.norm(axis)
     turn = SE3.exp([0, 0, 0, *axis])
     matrix = cell.camera.matrix()

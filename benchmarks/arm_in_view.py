@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
 from tqdm import tqdm
 
 from benchmarks.accuracy import pose_error, wrong
 from benchmarks.arm_faults import read_cell, spoil, write_cell
 from benchmarks.rows import Row, grouped, median_of, numbers, save
-from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
 from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside
 from evercal.recordings import load_recording
@@ -141,7 +141,9 @@ def run(
     done = {(row["part"], row["condition"], row["seed"]) for row in rows}
     for part in what:
         # One draw of all conditions after the other, so that a part of them says something.
-        conditions = {name: c for name, c in WHAT[part].items() if name in (only or [name])}
+        conditions = {
+            name: c for name, c in WHAT[part].items() if name in (only or [name])
+        }
         cells = {name: _rendered(c, data) for name, c in conditions.items()}
         for _ in tqdm(range(draws), desc=part):
             for name, condition in conditions.items():
@@ -206,7 +208,9 @@ def _of_faults(rows: list[Row]) -> list[Row]:
 
 def summary(rows: Sequence[Row]) -> list[Row]:
     """One row for each condition; `wrong`: over 10 mm and over five sigma."""
-    return [_summary(name, group) for (name,), group in grouped(rows, "condition").items()]
+    return [
+        _summary(name, group) for (name,), group in grouped(rows, "condition").items()
+    ]
 
 
 def _summary(name: str, group: list[Row]) -> Row:
@@ -229,5 +233,8 @@ def _summary(name: str, group: list[Row]) -> Row:
     }
     is_wrong = wrong(numbers(answers, "mm"), squared)
     silent = np.array([not answer["warnings"] for answer in answers])
-    row |= {"wrong": int(is_wrong.sum()), "wrong_unwarned": int((is_wrong & silent).sum())}
+    row |= {
+        "wrong": int(is_wrong.sum()),
+        "wrong_unwarned": int((is_wrong & silent).sum()),
+    }
     return row

@@ -88,7 +88,9 @@ def _meshes(shape: ET.Element) -> list[tuple[trimesh.Trimesh, tuple | None]]:
         sizes = [float(shape.get(key, "")) for key in ("radius", "length")]
         mesh = trimesh.creation.cylinder(*sizes, sections=48)
         return [(trimesh.graph.smooth_shade(mesh, angle=0.6), None)]
-    name = shape.get("filename", "").removeprefix("package://example-robot-data/robots/")
+    name = shape.get("filename", "").removeprefix(
+        "package://example-robot-data/robots/"
+    )
     scene = trimesh.load_scene(robots_folder() / name)
     found = []
     for node in scene.graph.nodes_geometry:

@@ -7,6 +7,7 @@ The URDF names the meshes of the package `example-robot-data` by their paths. A 
 not rendered again, and a recording can be continued with more images.
 """
 
+import itertools
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -67,8 +68,12 @@ ARMS = {
     "ur5": ArmKind(
         "ur_description/urdf/ur5_robot.urdf",
         (
-            "shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint",
-            "wrist_2_joint", "wrist_3_joint",
+            "shoulder_pan_joint",
+            "shoulder_lift_joint",
+            "elbow_joint",
+            "wrist_1_joint",
+            "wrist_2_joint",
+            "wrist_3_joint",
         ),
         (-2.0, -2.3, -2.2, -2.8, -2.5, -2.5),
         (2.0, -0.5, 2.2, 1.0, 2.5, 2.5),
@@ -88,7 +93,12 @@ ARMS = {
     "so101": ArmKind(
         "so_arm_description/urdf/so101.urdf",
         (
-            "shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper",
+            "shoulder_pan",
+            "shoulder_lift",
+            "elbow_flex",
+            "wrist_flex",
+            "wrist_roll",
+            "gripper",
         ),
         (-1.7, -1.6, -1.5, -1.5, -2.5, 0.0),
         (1.7, 1.3, 1.6, 1.5, 2.5, 1.5),
@@ -281,15 +291,13 @@ class _Skeleton:
             values = [joints[self.kind.joints.index(name)] for name in arm.joints]
             ends.append(arm.poses(np.array([values])).translation_m[0])
         points = []
-        for a, b in zip(ends[:-1], ends[1:], strict=True):
+        for a, b in itertools.pairwise(ends):
             steps = np.linspace(0, 1, int(np.linalg.norm(b - a) / 0.04) + 2)
             points.append(a + steps[:, None] * (b - a))
         return np.concatenate(points)
 
 
-def _view(
-    setting: Setting, scene: Room, rng: Generator
-) -> tuple[Camera, SE3] | None:
+def _view(setting: Setting, scene: Room, rng: Generator) -> tuple[Camera, SE3] | None:
     """Draw a camera; None where the room is not free between it and the arm."""
     kind = ARMS[setting.arm]
     width, height = setting.size

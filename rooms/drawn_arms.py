@@ -56,7 +56,9 @@ def draw(
 def linear_light(rgb: np.ndarray) -> np.ndarray:
     """Linear light of sRGB bytes."""
     levels = np.arange(256) / 255
-    curve = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
+    curve = np.where(
+        levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4
+    )
     return curve.astype(np.float32)[rgb]
 
 
@@ -64,7 +66,9 @@ def draw_beside(
     rgb: np.ndarray, shapes: ArmShapes, joints: np.ndarray, added: Part, stage: Stage
 ) -> np.ndarray:
     """Draw one more part onto an image (H, W, 3) that shows the arm, hidden by the arm."""
-    vertices, normals, faces, colours = _meshes_at([added, *shapes.parts], shapes, joints)
+    vertices, normals, faces, colours = _meshes_at(
+        [added, *shapes.parts], shapes, joints
+    )
     shade = _shade(vertices, normals, stage.light_m) * colours
     shade[len(added.vertices_m) :] = -1.0
     seen = stage.base_from_camera.inverse().apply(vertices)
@@ -191,10 +195,17 @@ def _shadow(stage: Stage, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray
         camera_from_base = looking(lamp, middle).inverse()
         seen = camera_from_base.apply(vertices)
         _, near = rasterize(seen, faces, blank, focal, np.full(2, 256.0), (512, 512))
-        x, y, z = camera_from_base.apply(points).astype(np.float32).T.reshape(3, *u.shape)
+        x, y, z = (
+            camera_from_base.apply(points).astype(np.float32).T.reshape(3, *u.shape)
+        )
         x, y = (focal * a / np.maximum(z, 0.05) + 255.5 for a in (x, y))
         near = cv2.remap(
-            near, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=_FAR_M
+            near,
+            x,
+            y,
+            cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=_FAR_M,
         )
         dark += (near < z - 0.01) / _LIGHTS
     dark = cv2.GaussianBlur(dark, (0, 0), 1.5)
