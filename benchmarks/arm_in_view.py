@@ -16,8 +16,10 @@ import numpy as np
 from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
 from tqdm import tqdm
 
+from benchmarks import eye_to_hand
 from benchmarks.accuracy import pose_error, wrong
-from benchmarks.arm_faults import read_cell, spoil, write_cell
+from benchmarks.arm_beside import beside
+from benchmarks.arm_faults import Cell, read_cell, spoil, write_cell
 from benchmarks.rows import Row, grouped, median_of, numbers, save
 from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside
@@ -55,12 +57,10 @@ MAIN = {
 }
 FEW = {f"{n} images": Condition(images=n) for n in (3, 5, 7, 15)}
 DISTANCES = {
-    "0.8 m": Condition({"distance_m": 0.8}, 10),
-    "2.5 m": Condition({"distance_m": 2.5}, 10),
-    "1.6 m, drawn": Condition({"drawn": True}, 25),
-    "1.6 m, drawn, 1280x720": Condition({"drawn": True, "size": (1280, 720)}, 25),
-    "0.8 m, drawn": Condition({"drawn": True, "distance_m": 0.8}, 25),
-    "2.5 m, drawn": Condition({"drawn": True, "distance_m": 2.5}, 25),
+    "1.6 m": Condition({"drawn": True}, 15),
+    "1.6 m, 1280x720": Condition({"drawn": True, "size": (1280, 720)}, 15),
+    "0.8 m": Condition({"drawn": True, "distance_m": 0.8}, 15),
+    "2.5 m": Condition({"drawn": True, "distance_m": 2.5}, 15),
 }
 DISTANCE_M = {"so101": 0.8, "scara": 1.2}
 """Of arms that are smaller than the others, which are at 1.6 m."""
@@ -86,7 +86,7 @@ SPOILED = {
     "meshes of another robot": ("robot", 0.0),
 }
 WRONG = {
-    name: Condition(fault=fault, size=size) for name, (fault, size) in SPOILED.items()
+    name: Condition({}, 15, fault, size) for name, (fault, size) in SPOILED.items()
 }
 
 
@@ -113,6 +113,7 @@ WHAT = {
     "arms": ARM_KINDS,
     "wrong": WRONG,
     "mass": MASS,
+    "beside": {},
 }
 """Conditions by the parts of the measurement."""
 
@@ -133,31 +134,69 @@ def run(
         draws: Recordings of each condition.
         only: Conditions of these parts; all if omitted.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    file = out / "rows.jsonl"
-    rows: list[Row] = []
-    if file.exists():
-        rows = [json.loads(line) for line in file.read_text().splitlines()]
-    done = {(row["part"], row["condition"], row["seed"]) for row in rows}
+    rows = Rows(out)
     for part in what:
         # One draw of all conditions after the other, so that a part of them says something.
-        conditions = {
-            name: c for name, c in WHAT[part].items() if name in (only or [name])
-        }
-        cells = {name: _rendered(c, data) for name, c in conditions.items()}
-        for _ in tqdm(range(draws), desc=part):
-            for name, condition in conditions.items():
-                setting = next(cells[name])
-                if (part, name, setting.seed) in done:
-                    continue
-                row: Row = {"part": part, "condition": name, "seed": setting.seed}
-                row |= _measured(condition, data / setting.name, setting.seed)
-                rows.append(row)
-                with file.open("a") as stream:
-                    stream.write(json.dumps(row) + "\n")
-    for (part,), group in grouped(rows, "part").items():
+        for name, condition, setting in _in_turn(part, only, draws, data):
+            if rows.has(part, name, setting.seed):
+                continue
+            cell = read_cell(data / setting.name, condition.images)
+            if condition.fault:
+                rng = np.random.default_rng([setting.seed, 45])
+                spoil(cell, condition.fault, condition.size, rng)
+            rows.add(part, name, setting.seed, _solved(cell))
+        if part == "beside":
+            _beside(rows, data, draws)
+    for (part,), group in grouped(rows.rows, "part").items():
         table = summary(group) if part != "mass" else _of_faults(group)
         save(out / f"arm-in-view-{part}.csv", table)
+
+
+class Rows:
+    """Rows of a file, each measured once."""
+
+    def __init__(self, out: Path) -> None:
+        out.mkdir(parents=True, exist_ok=True)
+        self._file = out / "rows.jsonl"
+        self.rows: list[Row] = []
+        if self._file.exists():
+            lines = self._file.read_text().splitlines()
+            self.rows = [json.loads(line) for line in lines]
+
+    def has(self, part: str, condition: str, seed: int) -> bool:
+        """Whether a row is measured."""
+        wanted = {"part": part, "condition": condition, "seed": seed}
+        return any(wanted.items() <= row.items() for row in self.rows)
+
+    def add(self, part: str, condition: str, seed: int, row: Row) -> None:
+        """Append a row to the file."""
+        row = {"part": part, "condition": condition, "seed": seed, **row}
+        self.rows.append(row)
+        with self._file.open("a") as stream:
+            stream.write(json.dumps(row) + "\n")
+
+
+def _in_turn(
+    part: str, only: Sequence[str], draws: int, data: Path
+) -> Iterator[tuple[str, Condition, Setting]]:
+    chosen = {name: c for name, c in WHAT[part].items() if name in (only or [name])}
+    cells = {name: _rendered(condition, data) for name, condition in chosen.items()}
+    for _ in tqdm(range(draws), desc=part):
+        for name, condition in chosen.items():
+            yield name, condition, next(cells[name])
+
+
+def _beside(rows: Rows, data: Path, draws: int) -> None:
+    for seed in tqdm(range(eye_to_hand.FIRST_SEED, eye_to_hand.FIRST_SEED + draws)):
+        if rows.has("beside", "board: arm in view", seed):
+            continue
+        try:
+            for name, found in beside(data, seed):
+                row = _solved(found) if isinstance(found, Cell) else found
+                if not rows.has("beside", name, seed):
+                    rows.add("beside", name, seed, row)
+        except InputError as error:
+            tqdm.write(str(error))
 
 
 def _rendered(condition: Condition, data: Path) -> Iterator[Setting]:
@@ -173,12 +212,8 @@ def _rendered(condition: Condition, data: Path) -> Iterator[Setting]:
         yield setting
 
 
-def _measured(condition: Condition, root: Path, seed: int) -> Row:
+def _solved(cell: Cell) -> Row:
     """Error of a calibration, or its refusal."""
-    cell = read_cell(root, condition.images)
-    if condition.fault:
-        rng = np.random.default_rng([seed, 45])
-        spoil(cell, condition.fault, condition.size, rng)
     with tempfile.TemporaryDirectory() as folder:
         recording = Path(folder) / "recording"
         write_cell(cell, recording)
@@ -217,24 +252,23 @@ def _summary(name: str, group: list[Row]) -> Row:
     answers = [row for row in group if "refused" not in row]
     row: Row = {"condition": name, "draws": len(group)}
     row["refused"] = len(group) - len(answers)
-    row["warned"] = sum(bool(answer["warnings"]) for answer in answers)
+    row["warned"] = sum(bool(answer.get("warnings")) for answer in answers)
     row["seconds"] = median_of(numbers(group, "seconds"))
     if not answers:
         return row
     for unit in ("mm", "deg"):
         errors = numbers(answers, unit)
         row |= {unit: median_of(errors), f"{unit}_90": float(np.quantile(errors, 0.9))}
-        row[f"sigma_{unit}"] = median_of(numbers(answers, f"sigma_{unit}"))
     squared = numbers(answers, "squared_mahalanobis")
-    row |= {
-        "inside_95": share_inside(squared),
-        "squared_mahalanobis": median_of(squared),
-        "confirmed": median_of(numbers(answers, "confirmed")),
-    }
+    if not len(squared):
+        return row
+    for key in ("sigma_mm", "sigma_deg", "squared_mahalanobis"):
+        row[key] = median_of(numbers(answers, key))
+    row["inside_95"] = share_inside(squared)
+    if "confirmed" in answers[0]:
+        row["confirmed"] = median_of(numbers(answers, "confirmed"))
     is_wrong = wrong(numbers(answers, "mm"), squared)
-    silent = np.array([not answer["warnings"] for answer in answers])
-    row |= {
-        "wrong": int(is_wrong.sum()),
-        "wrong_unwarned": int((is_wrong & silent).sum()),
-    }
+    silent = np.array([not answer.get("warnings") for answer in answers])
+    row["wrong"] = int(is_wrong.sum())
+    row["wrong_unwarned"] = int((is_wrong & silent).sum())
     return row

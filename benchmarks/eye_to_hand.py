@@ -134,7 +134,7 @@ def run(
                 if method != HELD and setting.thing != "board":
                     continue
                 row: Row = {"condition": name, "seed": seed, "method": method}
-                row |= _measured(method, condition, data, setting)
+                row |= measured(method, condition, data, setting)
                 rows.append(row)
                 with file.open("a") as stream:
                     stream.write(json.dumps(row) + "\n")
@@ -157,7 +157,7 @@ def _rendered(condition: Condition, data: Path) -> Iterator[Setting]:
         yield setting
 
 
-def _measured(method: str, condition: Condition, data: Path, setting: Setting) -> Row:
+def measured(method: str, condition: Condition, data: Path, setting: Setting) -> Row:
     """Error of one method in one recording, or its refusal."""
     truth = json.loads((data / setting.name / "truth.json").read_text())
     # A camera that is bumped half way has two true poses.

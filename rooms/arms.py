@@ -168,6 +168,12 @@ def urdf_of(arm: str) -> Path:
     return robots_folder() / ARMS[arm].urdf
 
 
+def packaged_urdf(arm: str) -> str:
+    """Text of the URDF of an arm, with the paths of its meshes."""
+    packages = f"{robots_folder().parent.parent}/"
+    return urdf_of(arm).read_text().replace("package://", packages)
+
+
 def render(setting: Setting, out: Path) -> Iterator[int]:
     """Render the missing images of a recording, yielding the number of each.
 
@@ -196,10 +202,8 @@ def write_recording(setting: Setting, plan: Plan, root: Path) -> None:
     camera = asdict(plan.camera)
     del camera["distortion"]
     write_json(folder / "camera.json", camera)
-    urdf = urdf_of(setting.arm)
-    text = urdf.read_text()
-    packages = f"{robots_folder().parent.parent}/"
-    write_bytes(folder / urdf.name, text.replace("package://", packages).encode())
+    urdf = folder / urdf_of(setting.arm).name
+    write_bytes(urdf, packaged_urdf(setting.arm).encode())
     truth = {**asdict(setting), "room": plan.room.kind}
     truth["base_from_camera"] = pose_to_dict(plan.base_from_camera)
     truth["joint_names"] = list(ARMS[setting.arm].joints)
