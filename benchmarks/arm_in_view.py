@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
 from tqdm import tqdm
 
 from benchmarks import eye_to_hand
@@ -21,6 +20,7 @@ from benchmarks.accuracy import pose_error, wrong
 from benchmarks.arm_beside import beside
 from benchmarks.arm_faults import Cell, read_cell, spoil, write_cell
 from benchmarks.rows import Row, grouped, median_of, numbers, save
+from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
 from evercal.errors import InputError
 from evercal.evaluation.metrics import share_inside
 from evercal.recordings import load_recording
