@@ -101,12 +101,12 @@ def robot_body(
     if not links:
         raise InputError(f"{model.path}: no link has geometry, so images show none")
     arms = tuple(model.arm(base, link.link) for link in links)
-    rest = {}
-    for arm in arms:
-        rest |= dict(zip(arm.joints, _rest(arm), strict=True))
-    still = [f"{name} at {rest[name]:.3g}" for name in rest if name not in joints]
+    named = dict.fromkeys(name for arm in arms for name in arm.joints)
+    still = [name for name in named if name not in joints]
     if still:
-        notes.append(f"joints without values stand still: {', '.join(still)}")
+        notes.append(
+            f"joints without values stand at 0, or amid their limits: {', '.join(still)}"
+        )
     return RobotBody(base, tuple(joints), tuple(links), arms, tuple(notes))
 
 
@@ -118,20 +118,23 @@ def _rest(arm: Arm) -> Array:
 
 def _links(urdf: Path, geometry: Sequence[Geometry]) -> list[LinkShape]:
     surfaces: dict[str, list[Triangles]] = {}
-    read = faces = 0
+    read = count = 0
     for part in geometry:
         with naming(f"link {part.link}"):
             if part.shape == "mesh":
                 file = mesh_file(urdf, part.file)
                 read += file.stat().st_size
                 require_at_most(read, "mesh_bytes", "bytes of meshes")
-                surface = _scaled(read_mesh(file), part.sizes)
+                vertices, faces = read_mesh(file)
+                vertices = vertices * part.sizes
+                if np.prod(part.sizes) < 0:
+                    faces = faces[:, ::-1]
             else:
-                surface = _primitive(part)
-            faces += len(surface.faces)
-            require_at_most(faces, "faces", "triangles of meshes")
-        turned = surface.vertices @ Rotation.from_euler("xyz", part.rpy).as_matrix().T
-        surface = surface._replace(vertices=turned + part.xyz)
+                vertices, faces = _primitive(part)
+            count += len(faces)
+            require_at_most(count, "faces", "triangles of meshes")
+        turned = vertices @ Rotation.from_euler("xyz", part.rpy).as_matrix().T
+        surface = Triangles(turned + part.xyz, faces)
         surfaces.setdefault(part.link, []).append(surface)
     links = [_link(name, joined(parts)) for name, parts in surfaces.items()]
     return [link for link in links if len(link.faces)]
@@ -148,13 +151,6 @@ def _link(name: str, surface: Triangles) -> LinkShape:
     if len(surface.faces) > _MANY:
         cell = _CELL_M
     return LinkShape(name, *merged(surface, cell))
-
-
-def _scaled(mesh: Triangles, scale: Sequence[float]) -> Triangles:
-    faces = mesh.faces
-    if np.prod(scale) < 0:
-        faces = faces[:, ::-1]
-    return Triangles(mesh.vertices * scale, faces)
 
 
 def _primitive(part: Geometry) -> Triangles:

@@ -1,6 +1,7 @@
 """`RobotModel`: an arm from its URDF."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,10 +36,15 @@ class ArmPoses(NamedTuple):
 
 
 class RobotModel:
-    """Links and joints of a URDF; its meshes are not read."""
+    """Links and joints of a URDF; its meshes are not read.
 
-    def __init__(self, path: PathLike) -> None:
+    `whole` is whether the values of all joints are read. The robot needs no gripper then: its pose
+    is that of its base.
+    """
+
+    def __init__(self, path: PathLike, whole: bool = False) -> None:
         self.path = Path(path)
+        self.whole = whole
         if not self.path.is_file():
             raise InputError(f"{path}: no such URDF file")
         if self.path.suffix == ".xacro":
@@ -74,6 +80,8 @@ class RobotModel:
 
     def chosen_links(self, base: str | None, gripper: str | None) -> tuple[str, str]:
         """Base and gripper link; if omitted, the root and the only end of the arm."""
+        if self.whole:
+            gripper = base or self.base_link
         parents = {joint.parent for joint in self._joints}
         ends = [link for link in self.links if link not in parents]
         if gripper is None and len(ends) != 1:
@@ -108,6 +116,13 @@ class RobotModel:
         notes = [
             f"gripper poses are those of {gripper} in {base}, from {self.path.name}"
         ]
+        if self.whole:
+            notes = [f"values of {len(arm.joints)} joints of {self.path.name} are read"]
+        unused = [name for name in names if name not in arm.joints]
+        if self.whole and unused:
+            notes.append(
+                f"values of no joint that moves by itself: {', '.join(unused)}"
+            )
         for name, column in zip(arm.joints, values.T, strict=True):
             self._refuse_degrees(name, column, source)
         for name, column in zip(arm.joints, values.T, strict=True):
@@ -120,9 +135,18 @@ class RobotModel:
     def read_arm(
         self, base: str, gripper: str, names: Sequence[str], source: PathLike
     ) -> Arm:
-        """The arm whose values are taken from those of some names."""
-        del names, source
-        return self.arm(base, gripper)
+        """The arm whose values are taken from those of some names: the chain, or all joints."""
+        arm = self.arm(base, gripper)
+        if not self.whole:
+            return arm
+        drivers = self.drivers()
+        joints = tuple(name for name in names if name in drivers)
+        if not joints:
+            raise InputError(
+                f"{source}: no value is of a joint of {self.path}; given are"
+                f" {', '.join(names) or 'none'}, its joints are {', '.join(drivers)}"
+            )
+        return replace(arm, joints=joints, ranges=self._ranges(joints))
 
     def arm(self, base: str, gripper: str) -> Arm:
         """The chain between two links; its joint values are those that others do not mimic."""
@@ -157,9 +181,9 @@ class RobotModel:
             if backwards:
                 before = before @ np.linalg.inv(origin)
         joints = tuple(names)
-        return Arm(joints, tuple(chain), before, self.ranges(joints), self.path.name)
+        return Arm(joints, tuple(chain), before, self._ranges(joints), self.path.name)
 
-    def ranges(self, joints: Sequence[str]) -> Array:
+    def _ranges(self, joints: Sequence[str]) -> Array:
         """(k, 3) lower limit, middle and upper limit of joints."""
         limits = [
             self._joint_named[name].numbers[end]

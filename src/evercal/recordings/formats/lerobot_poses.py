@@ -15,10 +15,11 @@ from evercal.recordings.poses.conventions import (
     asking_for,
     pose_convention,
 )
-from evercal.recordings.poses.joint_tables import in_radians, poses_of_arm, robot_of
+from evercal.recordings.poses.joint_tables import in_radians, poses_of_arm
 from evercal.recordings.poses.pose_units import checked_poses
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
+from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import named_errors, refuse_repeated
 from evercal.typing import Array
 
@@ -117,7 +118,7 @@ def _joint_poses(
         raise InputError(f"{source} has {count} numbers and {len(names)} names")
     with named_errors(source, "names"):
         refuse_repeated(names, "rename the numbers")
-    model = robot_of(options.urdf, options)
+    model = RobotModel(options.urdf, options.whole_robot)
     values = in_radians(model, names, values, [options.pose_convention] * count)
     links = (options.base_frame, options.gripper_frame)
     moved = model.poses(names, values, *links, source)

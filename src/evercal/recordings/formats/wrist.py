@@ -20,7 +20,7 @@ from evercal.recordings.cameras import camera_fields, camera_file
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, files_in, first_size
 from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
-from evercal.recordings.poses.joint_tables import read_joint_poses, robot_of
+from evercal.recordings.poses.joint_tables import read_joint_poses
 from evercal.recordings.poses.pairing import pair_images, pair_joints
 from evercal.recordings.poses.robot_poses import (
     POSE_ENDINGS,
@@ -30,6 +30,7 @@ from evercal.recordings.poses.robot_poses import (
 from evercal.recordings.poses.row_files import number_array, read_rows, same_numbers
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.frame_names import FrameNames
+from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import named_errors, read_json, refuse_repeated
 
 
@@ -180,7 +181,7 @@ def _rows(
     root: Path, file: Path, options: ReadOptions, convention: str | None
 ) -> tuple[RobotPoses, list[str]]:
     if file.name in _JOINTS:
-        model = robot_of(options.urdf or urdf_beside(root), options)
+        model = RobotModel(options.urdf or urdf_beside(root), options.whole_robot)
         links = options.base_frame, options.gripper_frame
         return read_joint_poses(file, model, *links, options.pose_convention)
     if file.name.startswith("metadata"):

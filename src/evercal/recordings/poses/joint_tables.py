@@ -13,9 +13,7 @@ from evercal.errors import InputError
 from evercal.recordings.poses.pose_track import times_around
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import LabelledRows, read_rows, row_labels
-from evercal.recordings.read_options import ReadOptions
 from evercal.robot.robot_model import ArmPoses, RobotModel
-from evercal.robot.whole_robot import WholeRobot
 from evercal.storage.text_files import (
     library_errors,
     named_errors,
@@ -31,13 +29,6 @@ _STILL_RAD = 0.001
 _JSON = (
     "an object with 'joint_names', 'positions' and optionally 'images' or 'stamps_s'"
 )
-
-
-def robot_of(urdf: Path, options: ReadOptions) -> RobotModel:
-    """The robot whose joint values are read: its arm, or all of it."""
-    if options.whole_robot:
-        return WholeRobot(urdf)
-    return RobotModel(urdf)
 
 
 def read_joint_poses(

@@ -1,6 +1,7 @@
 """Where the gripper was at the images of a bag: from tf, or from joint states and a URDF."""
 
 import dataclasses
+import math
 from pathlib import Path
 
 import pytest
@@ -77,7 +78,7 @@ def test_poses_of_a_still_arm_cover_long_gaps(tmp_path: Path) -> None:
 def test_joint_states_with_a_urdf_replace_tf(tmp_path: Path, urdf: Path) -> None:
     bag = Bag("ros1")
     for i in range(21):
-        bag.joints(i / 10, {"finger": 0.0, "turn": i / 10})
+        bag.joints(i / 10, {"finger": 0.0, "turn": i / 10, "wheel": math.nan})
     for at in (0.25, 1.99, 2.3):
         bag.image(at, "/cam/image_raw", picture(0))
     bag.info()

@@ -1,5 +1,6 @@
 """Poses at the images of a bag, from tf or from joint states and a URDF."""
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from typing import Literal, NoReturn
@@ -15,7 +16,7 @@ from evercal.recordings.formats.bags.tf_tree import (
     STATIC,
     TfTree,
 )
-from evercal.recordings.poses.joint_tables import interpolate, poses_of_arm, robot_of
+from evercal.recordings.poses.joint_tables import interpolate, poses_of_arm
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.frame_names import FrameNames
@@ -44,7 +45,7 @@ def poses_at_images(
     zero = int(stamps_ns[0])
     stamps = (stamps_ns - zero).astype(float) * 1e-9
     if options.urdf is not None:
-        model = robot_of(options.urdf, options)
+        model = RobotModel(options.urdf, options.whole_robot)
         return _from_joints(bag, stamps, zero, model, options)
     tree, times = _tf(bag, zero, options.pose_topic)
     base = tree.frame(options.base_frame, BASES, "base_frame")
@@ -142,5 +143,8 @@ def _joint_tracks(
         for name, position in zip(
             message.content.name, message.content.position, strict=False
         ):
-            tracks[name][message.topic].append((stamp, float(position)))
+            if math.isfinite(
+                position
+            ):  # drivers state nan for what they do not measure
+                tracks[name][message.topic].append((stamp, float(position)))
     return tracks
