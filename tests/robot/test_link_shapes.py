@@ -191,6 +191,16 @@ def test_a_mesh_survives_a_missing_texture(tmp_path: Path) -> None:
     assert read(tmp_path, mesh("cube.dae")).links
 
 
+def test_all_parts_of_an_obj_count(tmp_path: Path) -> None:
+    lines = [f"v {x} {y} {z}" for x, y, z in CUBE]
+    for number, quad in enumerate(QUADS):
+        corners = " ".join(str(int(corner) + 1) for corner in quad)
+        lines += [f"o side{number}", f"usemtl colour{number}", f"f {corners}"]
+    (tmp_path / "cube.obj").write_text("\n".join(["mtllib lost.mtl", *lines]))
+    (link,) = read(tmp_path, mesh("cube.obj")).links
+    assert (len(link.vertices), len(link.faces)) == (8, 12)
+
+
 def test_fine_meshes_are_simplified(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(6, 0.03)
     assert len(ball.faces) > 80_000

@@ -208,7 +208,7 @@ def urdf_beside(root: Path) -> Path:
     if len(files) != 1:
         number = f"{len(files)} URDF files" if files else "no URDF"
         raise InputError(
-            f"{root}: joint angles need a URDF, {number} is beside them; give `urdf`"
+            f"{root}: a file of joints needs a URDF, {number} is beside it; give `urdf`"
         )
     return files[0]
 
