@@ -23,11 +23,13 @@ class ArmInView(args.Verb):
     Example: evercal arm-in-view recording/ --urdf robot.urdf --out camera.json
     """
 
-    writes = ("out",)
+    writes = ("out", "report")
     recording: Annotated[Positional[Path], args.shown("RECORDING")]
     """Folder of images with joints.csv, or a bag with joint states."""
     out: args.OutFile = Path("calibration.json")
     """Output file."""
+    report: args.File = None
+    """Also write an HTML report: the outline of the arm drawn into the images, residuals."""
     without: Annotated[tuple[str, ...], args.shown("LINK...")] = ()
     """Links whose mesh is not what is mounted, such as another gripper."""
     reading: args.HowRead = field(default_factory=args.Reading)
@@ -36,6 +38,7 @@ class ArmInView(args.Verb):
 
     def run(self) -> int:
         require_writable(self.out, "--out")
+        require_writable(self.report, "--report")
         point = args.Point.parse(self.at)
         from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
         from evercal.calibration.verdict import tier
@@ -55,6 +58,18 @@ class ArmInView(args.Verb):
                 on_progress=bars.step,
             )
         calibration.write(self.out)
+        if self.report is not None:
+            from evercal.reports.arm_pictures import arm_pictures
+            from evercal.reports.calibration_page import (
+                NamedCalibration,
+                calibration_page,
+            )
+            from evercal.storage import write_bytes
+
+            images = arm_pictures(calibration, recording, model, self.without)
+            named = NamedCalibration(self.out.name, calibration)
+            page = calibration_page(named, images, point_m=point)
+            write_bytes(self.report, page.html.encode())
         self.answer(
             {**calibration.to_dict(), **at_record(calibration, point)},
             *calibration_lines(calibration, point),

@@ -23,6 +23,7 @@ from evercal.reports.overlay import (
     draw_residuals,
     resized,
 )
+from evercal.reports.page import Table
 from evercal.reports.scene import Surroundings
 from evercal.typing import Array, Image, Strings
 
@@ -71,6 +72,8 @@ class AnnotatedImages:
     """Whether the map in the store differs from the map of the calibration."""
     surroundings: Surroundings = field(default_factory=Surroundings)
     """The map that a fixed camera was calibrated in; empty without a store."""
+    links: Table | None = None
+    """How the images show each link, where the outline of an arm is drawn."""
 
 
 def select_images(

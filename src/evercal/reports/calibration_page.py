@@ -264,9 +264,11 @@ def residual_chart(calibration: Calibration) -> Chart | None:
     numbers = np.arange(1.0, len(images) + 1)
     end = max(len(images), 5) + 0.6
     width = 0.8 * _BARS_PX[0] / (end - 0.4)
-    below = "number of the image in the table"
+    below = ("", "number of the image in the table")
+    if not np.isfinite(rows[:, 1]).any():
+        rows = rows[:, :1]
     for values, unit, label in zip(
-        np.nan_to_num(rows).T, ("mm", "deg"), ("", below), strict=True
+        np.nan_to_num(rows).T, ("mm", "deg"), below[-rows.shape[1] :], strict=False
     ):
         typical = float(values[used].max(initial=0.0))
         highest = 1.1 * float(values.max())
