@@ -61,7 +61,7 @@ def images(body: RobotBody, values: np.ndarray, seed: int = 0) -> list[np.ndarra
     size = large.width, large.height
     background = cv2.resize(background, size, interpolation=cv2.INTER_CUBIC)
     colours = rng.uniform(150, 250, (len(body.links) + 1, 3))
-    rasterizer = Rasterizer(body)
+    rasterizer = Rasterizer(body.links)
     pose = BASE_FROM_CAMERA.inverse().matrix()
     shots = []
     for frames in body.frames(values).swapaxes(0, 1):

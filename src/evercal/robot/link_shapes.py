@@ -1,7 +1,9 @@
 """`robot_body`: the surfaces of a robot's links, from the geometry of its URDF."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,6 +37,11 @@ class LinkShape:
     """(n, 3) metres, in the link's frame."""
     faces: IntArray
     """(m, 3) vertices of each triangle, counterclockwise as seen from outside."""
+
+    def simplified(self, cell_m: float) -> Self:
+        """The surface with one vertex for those in each cell of a grid."""
+        mesh = merged(Triangles(self.vertices, self.faces), cell_m)
+        return replace(self, vertices=mesh.vertices, faces=mesh.faces)
 
 
 @frozen_arrays

@@ -8,46 +8,76 @@ What all images share, the priors of the fit hold: each is a part of its own.
 import numpy as np
 
 from evercal.calibration.arm_in_view.fit import (
-    CENTRE,
-    FOCAL,
     JOINTS,
     LEAST_REPEATS,
+    LENS,
     OUTLINE,
     POSE,
     ArmFit,
-    cluster_scatter,
 )
 from evercal.geometry import in_parent_axes
-from evercal.typing import Array, IntArray
+from evercal.typing import Array, BoolArray
 
 _SHARED = {
-    "intrinsics": (slice(FOCAL, CENTRE.stop), "lens"),
+    "intrinsics": (LENS, "lens"),
     "a shift of all outlines": (slice(OUTLINE, JOINTS), "images"),
     "offsets of joints": (slice(JOINTS, None), "arm"),
 }
 """Parameters with a prior, by the name of their part, and its cause."""
+SCATTER = "scatter of the outlines"
+"""Name of the part of the residuals."""
 
 
-def parts(fit: ArmFit) -> dict[str, tuple[Array, str]]:
+def parts(fit: ArmFit, free: BoolArray | None = None) -> dict[str, tuple[Array, str]]:
     """Covariances (10 + k, 10 + k) of the parameters by name, with their causes.
 
-    Parameters that are not free have zeros. The sum is the covariance.
+    Their sum is the covariance. Intrinsics that were not estimated err by what the images leave of
+    their prior (S. Schmidt, Application of state-space methods to navigation problems, 1966).
     """
-    free = np.flatnonzero(fit.free)
-    inverse = np.linalg.inv(fit.normal)
+    lens = np.zeros((3, 3))
+    if free is None:
+        free = fit.free
+        if not free[LENS].any():
+            lens = lens_covariance(fit)
+    columns = np.flatnonzero(free)
+    inverse = np.linalg.inv(fit.normal(free))
     sigma = fit.priors.sigma()
-    count = len(sigma)
-    found = {}
-    for name, (columns, cause) in _SHARED.items():
-        own = np.full(count, np.inf)
-        own[columns] = sigma[columns]
-        added = inverse @ np.diag(1 / own[free] ** 2) @ inverse
-        found[name] = (_whole(added, free, count), cause)
-    scatter = inverse @ _scatter(fit) @ inverse
-    return {
-        "scatter of the outlines": (_whole(scatter, free, count), "images"),
-        **found,
-    }
+    least = LEAST_REPEATS / fit.repeats * fit.information()[np.ix_(free, free)]
+    scatter = inverse @ (fit.scatter(free) + least) @ inverse
+    found = {SCATTER: (_whole(scatter, columns, len(sigma)), "images")}
+    by_lens = inverse @ fit.information()[np.ix_(columns, np.arange(len(sigma))[LENS])]
+    for name, (own, cause) in _SHARED.items():
+        precision = np.zeros(len(sigma))
+        precision[own] = 1 / np.maximum(sigma[own], 1e-12) ** 2
+        added = inverse @ np.diag(precision[free]) @ inverse
+        if cause == "lens":
+            added = added + by_lens @ lens @ by_lens.T
+        found[name] = (_whole(added, columns, len(sigma)), cause)
+    return found
+
+
+def lens_covariance(fit: ArmFit) -> Array:
+    """(3, 3) of focal length and principal point, by their prior and the images."""
+    return sum(part for part, _ in parts(fit, _with_lens(fit)).values())[LENS, LENS]
+
+
+def lens_is_wrong(fit: ArmFit) -> bool:
+    """Whether the images contradict the stated focal length."""
+    focal = fit.step(_with_lens(fit))[LENS][0]
+    sigma = float(np.sqrt(lens_covariance(fit)[0, 0]))
+    return abs(focal) > max(WRONG_SIGMAS * sigma, WRONG_FOCAL)
+
+
+WRONG_SIGMAS = 3.0
+"""Change of the focal length in standard deviations from which it is estimated."""
+WRONG_FOCAL = 0.003
+"""Smaller changes do not count."""
+
+
+def _with_lens(fit: ArmFit) -> BoolArray:
+    free = fit.free.copy()
+    free[LENS] = True
+    return free
 
 
 def in_base(fit: ArmFit, covariance: Array) -> Array:
@@ -60,26 +90,10 @@ def halves(fit: ArmFit) -> Array:
     """(6,) distance of the poses by every second image and by the others, in camera axes."""
     numbers = np.unique(fit.equations.image)
     is_odd = np.isin(fit.equations.image, numbers[1::2])
-    precision = 1 / fit.priors.sigma()[fit.free] ** 2
-    steps = []
-    for rows in (is_odd, ~is_odd):
-        slopes = fit.equations.slopes[rows][:, fit.free]
-        weighted = slopes * fit.weights[rows, None] / (fit.scale_px**2 * fit.repeats)
-        normal = weighted.T @ slopes + np.diag(precision)
-        steps.append(np.linalg.solve(normal, weighted.T @ fit.equations.px[rows]))
-    return (steps[0] - steps[1])[POSE]
+    return (fit.step(fit.free, is_odd) - fit.step(fit.free, ~is_odd))[POSE]
 
 
-def _scatter(fit: ArmFit) -> Array:
-    """Covariance of the right side of the normal equations by clusters of residuals."""
-    slopes = fit.equations.slopes[:, fit.free]
-    weighted = slopes * fit.weights[:, None] / (fit.scale_px**2 * fit.repeats)
-    gradients = weighted * fit.equations.px[:, None]
-    least = LEAST_REPEATS / fit.repeats * weighted.T @ slopes
-    return least + cluster_scatter(gradients, fit.equations)
-
-
-def _whole(covariance: Array, free: IntArray, count: int) -> Array:
+def _whole(covariance: Array, columns: Array, count: int) -> Array:
     whole = np.zeros((count, count))
-    whole[np.ix_(free, free)] = covariance
+    whole[np.ix_(columns, columns)] = covariance
     return whole

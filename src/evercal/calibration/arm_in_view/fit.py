@@ -26,6 +26,7 @@ from evercal.typing import Array, BoolArray, IntArray
 POSE = slice(0, 6)
 FOCAL = 6
 CENTRE = slice(7, 9)
+LENS = slice(6, 9)
 OUTLINE = 9
 JOINTS = 10
 """Columns of the parameters; one for each joint value from `JOINTS` on."""
@@ -33,6 +34,8 @@ LEAST_SCALE_PX = 0.3
 """Least robust standard deviation of the residuals."""
 LEAST_REPEATS = 2.0
 """Least number of neighbouring residuals that err alike."""
+_ROUGH = 0.004
+"""Cells in which vertices are merged where only the place of links counts, in reaches."""
 _LONGEST_STEP = 0.3
 """Metres or radians."""
 
@@ -41,14 +44,19 @@ _LONGEST_STEP = 0.3
 class Priors:
     """Standard deviations of the parameters before the images."""
 
-    focal: float = 0.001
+    focal: float = 0.005
     """Of the logarithm of the focal length."""
-    centre_px: float = 0.5
+    centre_px: float = 1.0
     """Of the principal point."""
     outline_px: float = 0.25
     """Of a common shift of all outlines: light, blur, simplified meshes."""
     joints: Array = field(default_factory=lambda: np.zeros(0))
     """(k,) of the offsets of joint values; 0 of those that are not estimated."""
+    lens_is_free: bool = False
+    """Whether focal length and principal point are estimated. If not, their errors count all the
+    same: a right lens is known better than an arm tells it."""
+    pose_only: bool = False
+    """Whether nothing but the pose is estimated."""
 
     def sigma(self) -> Array:
         """(10 + k,) of all parameters; infinite of the pose."""
@@ -56,29 +64,27 @@ class Priors:
         shared = [self.focal, self.centre_px, self.centre_px, self.outline_px]
         return np.concatenate([pose, shared, self.joints])
 
-    def widened(self, fit: "ArmFit") -> Self:
-        """Priors of the size of their parameters, where that is larger.
+    def free(self) -> BoolArray:
+        """(10 + k,) whether a parameter is estimated."""
+        free = self.sigma() > 0
+        free[LENS] &= self.lens_is_free
+        free[POSE.stop :] &= not self.pose_only
+        return free
 
-        The size of a kind is estimated as by D. MacKay, Bayesian interpolation, 1992.
+    def widened(self, fit: "ArmFit") -> Self:
+        """With joint offsets of the size that they have, where that is larger.
+
+        The size is estimated as by D. MacKay, Bayesian interpolation, 1992.
         """
+        free = np.flatnonzero(fit.free)
         variance = np.zeros(len(fit.free))
-        variance[fit.free] = np.diag(np.linalg.inv(fit.normal))
+        variance[free] = np.diag(np.linalg.inv(fit.normal()))
         squares = fit.estimate.parameters**2 + variance
-        sizes = []
-        for column in (FOCAL, OUTLINE):
-            sizes.append(float(np.sqrt(squares[column])))
-        focal, outline = sizes
-        joints = self.joints
-        is_free = joints > 0
-        if is_free.any():
-            ratio = squares[JOINTS:][is_free] / joints[is_free] ** 2
-            joints = joints * max(1.0, float(np.sqrt(ratio.mean())))
-        return replace(
-            self,
-            focal=max(focal, self.focal),
-            outline_px=max(outline, self.outline_px),
-            joints=joints,
-        )
+        offsets = self.joints > 0
+        if not offsets.any():
+            return self
+        ratio = squares[JOINTS:][offsets] / self.joints[offsets] ** 2
+        return replace(self, joints=self.joints * max(1, np.sqrt(ratio.mean())))
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +108,7 @@ class Estimate:
         pose = pose * min(1.0, _LONGEST_STEP / max(longest, 1e-12))
         change = step.copy()
         change[POSE] = 0
-        lens = change[FOCAL : CENTRE.stop]
-        camera = self.camera.changed(lens).pinhole
+        camera = self.camera.changed(change[LENS]).pinhole
         camera_from_base = SE3.exp(pose) @ self.camera_from_base
         return Estimate(camera_from_base, camera, self.parameters + change)
 
@@ -135,16 +140,57 @@ class ArmFit:
     """Robust standard deviation of the residuals."""
     repeats: float
     """Number of neighbouring residuals that err alike: their information counts once."""
-    normal: Array
-    """(p, p) normal matrix of the free parameters, with priors."""
     free: BoolArray
-    """(10 + k,)."""
+    """(10 + k,) whether a parameter is estimated."""
     priors: Priors
+
+    def information(self) -> Array:
+        """(10 + k, 10 + k) of the residuals."""
+        weights = self.weights / (self.scale_px**2 * self.repeats)
+        slopes = self.equations.slopes
+        return (slopes * weights[:, None]).T @ slopes
+
+    def normal(self, free: BoolArray | None = None) -> Array:
+        """(p, p) normal matrix of free parameters, with priors."""
+        free = self.free if free is None else free
+        precision = 1 / self.priors.sigma()[free] ** 2
+        return self.information()[np.ix_(free, free)] + np.diag(precision)
+
+    def gradients(self) -> Array:
+        """(m, 10 + k) of the residuals."""
+        weights = self.weights * self.equations.px / (self.scale_px**2 * self.repeats)
+        return self.equations.slopes * weights[:, None]
+
+    def step(self, free: BoolArray, rows: BoolArray | None = None) -> Array:
+        """(10 + k,) of the free parameters, by all residuals or some of them."""
+        right = self.gradients()
+        right = right.sum(0) if rows is None else 2 * right[rows].sum(0)
+        precision = 1 / self.priors.sigma()[free] ** 2
+        step = np.zeros(len(free))
+        spent = precision * self.estimate.parameters[free]
+        step[free] = np.linalg.solve(self.normal(free), right[free] - spent)
+        return step
+
+    def scatter(self, free: BoolArray) -> Array:
+        """(p, p) covariance of the sum of gradients: clusters of images, and of links."""
+        gradients = self.gradients()[:, free]
+        by_image = _of_clusters(gradients, self.equations.image)
+        return by_image + _of_clusters(gradients, self.equations.link)
 
     @property
     def confirmed(self) -> float:
         """Share of the outline that the images show, 0 to 1."""
         return float(self.weights.sum() / max(self.equations.testable.sum(), 1))
+
+
+class Search(NamedTuple):
+    """How outlines are searched in an image."""
+
+    edges: list[LinkEdges]
+    reach_px: float
+    """Largest distance from the drawn outline."""
+    spacing_px: float
+    """Distance of its points."""
 
 
 class Fitter:
@@ -153,8 +199,11 @@ class Fitter:
     def __init__(self, views: ArmViews) -> None:
         self.views = views
         self.moving = moving_links(views)
-        self._rasterizer = Rasterizer(views.body)
-        self._edges: list[LinkEdges] = [*map(link_edges, views.body.links)]
+        shapes = views.body.links
+        rough = [shape.simplified(_ROUGH * self.reach_m()) for shape in shapes]
+        self._rasterizer = Rasterizer(rough)
+        self._edges = [*map(link_edges, shapes)]
+        self._rough_edges = [*map(link_edges, rough)]
 
     def fit(
         self,
@@ -176,8 +225,10 @@ class Fitter:
             drawings = [self.draw(estimate, frames[:, i]) for i in images]
             if number in learn_at:
                 self._learn(images, drawings, reach)
+            edges = self._edges if learn_at else self._rough_edges
+            how = Search(edges, reach, spacing_px)
             rows = [
-                self._rows(estimate, frames[:, i], i, drawing, (reach, spacing_px))
+                self._rows(estimate, frames[:, i], i, drawing, how)
                 for i, drawing in zip(images, drawings, strict=True)
             ]
             equations = _joined(rows)
@@ -186,6 +237,14 @@ class Fitter:
             if learn_at and number >= max(learn_at):
                 priors = priors.widened(fit)
         return fit
+
+    def reach_m(self) -> float:
+        """Radius of the space in which the links move, metres."""
+        frames = self.views.body.frames(self.views.values)
+        places = frames[self.moving, :, :3, 3].reshape(-1, 3)
+        if not len(places):
+            return 0.0
+        return float(np.linalg.norm(places - places.mean(0), axis=1).max())
 
     def start(self, camera_from_base: SE3) -> Estimate:
         """A start with the stated camera and joint values."""
@@ -218,16 +277,15 @@ class Fitter:
         base_from_link: Array,
         i: int,
         drawing: Drawing,
-        reach_and_spacing: tuple[float, float],
+        how: "Search",
     ) -> Equations:
         """Residuals of one image."""
-        reach, spacing = reach_and_spacing
         pose = estimate.camera_from_base.matrix()
         camera = estimate.camera
         links = pose @ base_from_link
-        points = outline_points(self._edges, links, camera, drawing, spacing)
+        points = outline_points(how.edges, links, camera, drawing, how.spacing_px)
         points = points.at(self.moving[points.link])
-        offsets = image_offsets(self.views, i, points, reach)
+        offsets = image_offsets(self.views, i, points, how.reach_px)
         testable = np.bincount(
             points.link[offsets.testable], minlength=len(self._edges)
         )
@@ -294,34 +352,19 @@ def _joined(rows: Sequence[Equations]) -> Equations:
 
 def solved(estimate: Estimate, equations: Equations, priors: Priors) -> ArmFit:
     """One robust Gauss-Newton step."""
-    sigma = priors.sigma()
-    free = sigma > 0
-    slopes = equations.slopes[:, free]
+    free = priors.free()
     px = equations.px
     if len(px) < 2 * free.sum():
         raise TooFewPoints
     scale = max(LEAST_SCALE_PX, 1.4826 * float(np.median(np.abs(px))))
     weights = 1 / (1 + (px / (2 * scale)) ** 2) ** 2
-    weighted = slopes * weights[:, None] / scale**2
-    information = weighted.T @ slopes
-    scatter = cluster_scatter(weighted * px[:, None], equations)
+    fit = ArmFit(estimate, equations, weights, scale, 1.0, free, priors)
+    information = fit.information()[np.ix_(free, free)]
+    scatter = fit.scatter(free)
     ridge = 1e-9 * np.diag(np.diag(information))
     repeats = np.trace(np.linalg.solve(information + ridge, scatter)) / len(scatter)
-    repeats = max(LEAST_REPEATS, float(repeats))
-    precision = 1 / sigma[free] ** 2
-    normal = information / repeats + np.diag(precision)
-    right = weighted.T @ px / repeats - precision * estimate.parameters[free]
-    step = np.zeros(len(sigma))
-    step[free] = np.linalg.solve(normal, right)
-    moved = estimate.moved(step)
-    return ArmFit(moved, equations, weights, scale, repeats, normal, free, priors)
-
-
-def cluster_scatter(gradients: Array, equations: Equations) -> Array:
-    """(p, p) covariance of the sum of gradients (m, p) of images, and of links."""
-    return _of_clusters(gradients, equations.image) + _of_clusters(
-        gradients, equations.link
-    )
+    fit = replace(fit, repeats=max(LEAST_REPEATS, float(repeats)))
+    return replace(fit, estimate=estimate.moved(fit.step(free)))
 
 
 def _of_clusters(gradients: Array, owners: IntArray) -> Array:

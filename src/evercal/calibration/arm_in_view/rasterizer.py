@@ -1,12 +1,13 @@
 """`Rasterizer`: which link of an arm each pixel of a pinhole camera shows, and how far it is."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from evercal.geometry import Camera
-from evercal.robot.link_shapes import RobotBody
+from evercal.robot.link_shapes import LinkShape
 from evercal.typing import Array, Float32Array, IntArray
 
 _NEAR_M = 0.05
@@ -29,16 +30,16 @@ class Drawing(NamedTuple):
 class Rasterizer:
     """Draws the links of an arm with OpenCV's rasterizer."""
 
-    def __init__(self, body: RobotBody) -> None:
+    def __init__(self, shapes: Sequence[LinkShape]) -> None:
         faces = []
         shades = []
         first = 0
-        for number, shape in enumerate(body.links):
+        for number, shape in enumerate(shapes):
             faces.append(shape.faces + first)
             shade = np.full((len(shape.vertices), 3), (number + 1) / _SHADES)
             shades.append(shade)
             first += len(shape.vertices)
-        self._vertices = [shape.vertices for shape in body.links]
+        self._vertices = [shape.vertices for shape in shapes]
         self._faces = np.concatenate(faces).astype(np.int32)
         self._shades = np.concatenate(shades).astype(np.float32)
         settings = cv2.TriangleRasterizeSettings()

@@ -6,8 +6,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from evercal.calibration.arm_in_view.covariance import halves, in_base, parts
-from evercal.calibration.arm_in_view.fit import FOCAL, JOINTS, ArmFit, Fitter
+from evercal.calibration.arm_in_view.covariance import SCATTER, halves, in_base, parts
+from evercal.calibration.arm_in_view.fit import FOCAL, JOINTS, LENS, ArmFit, Fitter
 from evercal.calibration.calibration import Calibration, ErrorTerm
 from evercal.calibration.checks import Checks
 from evercal.calibration.framed_pose import ImageUse, JointOffset
@@ -52,7 +52,7 @@ def calibration_of(
         of_pose = of_pose + added
         terms.append(ErrorTerm.of("distance of halves of the images", added, "images"))
     stated = frames[0].camera
-    estimated = stated.changed(fit.estimate.parameters[FOCAL : FOCAL + 3])
+    estimated = stated.changed(fit.estimate.parameters[LENS])
     return Calibration(
         "eye_to_hand",
         fit.estimate.camera_from_base.inverse(),
@@ -77,7 +77,7 @@ def with_verdict(calibration: Calibration, warnings: Sequence[str]) -> Calibrati
 
 
 def _of_images(fit: ArmFit, whole: dict[str, tuple[Array, str]]) -> Array:
-    scatter, _ = whole["scatter of the outlines"]
+    scatter, _ = whole[SCATTER]
     return scatter[:6, :6]
 
 

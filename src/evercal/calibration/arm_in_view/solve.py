@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from evercal.calibration.arm_in_view.covariance import lens_is_wrong
 from evercal.calibration.arm_in_view.fit import (
     ArmFit,
     Fitter,
@@ -40,6 +41,8 @@ MOST_IMAGES = 40
 """Images that are used; more of them are chosen by the motion of the joints."""
 _SLIDING_M = 0.5
 """Offset of a sliding joint for a radian of others."""
+WRONG_LENS = 0.02
+"""Standard deviation of the focal length where the images contradict the stated one."""
 FIRST_STARTS = 4
 """Starts that are fitted; the others only if none of them is confirmed."""
 SURE_CONFIRMED = 0.3
@@ -160,6 +163,11 @@ def fit_arm(
     reaches = [zoom * reach for reach in _FINAL_PX]
     try:
         fit = fitter.fit(best, priors, every, reaches, _SPACING_PX, _LEARN_AT)
+        if lens_is_wrong(fit):
+            priors = replace(priors, lens_is_free=True, focal=WRONG_LENS)
+            fit = fitter.fit(
+                fit.estimate, priors, every, reaches[-4:], _SPACING_PX, _LEARN_AT
+            )
     except TooFewPoints:
         raise InputError(NOT_RECOGNISED) from None
     if fit.confirmed < LEAST_CONFIRMED:
@@ -176,10 +184,8 @@ def _best_start(
 ) -> ArmFit:
     views = fitter.views
     overlap = Overlap(views, fitter.moving)
-    poses = starts(overlap, reach_of(fitter))
-    pose_only = replace(
-        priors, focal=0, centre_px=0, outline_px=0, joints=0 * priors.joints
-    )
+    poses = starts(overlap, fitter.reach_m())
+    pose_only = replace(priors, pose_only=True)
     few = np.linspace(0, len(views) - 1, min(SHORT_IMAGES, len(views)))
     few = np.unique(few.round().astype(int))
     reaches = [zoom * reach for reach in _SHORT_PX]
@@ -199,11 +205,3 @@ def _best_start(
     if best is None:
         raise InputError(NOT_RECOGNISED)
     return best
-
-
-def reach_of(fitter: Fitter) -> float:
-    """Radius of the space in which the links move, metres."""
-    views = fitter.views
-    frames = views.body.frames(views.values)[fitter.moving]
-    places = frames[..., :3, 3].reshape(-1, 3)
-    return float(np.linalg.norm(places - places.mean(0), axis=1).max())
