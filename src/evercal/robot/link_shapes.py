@@ -65,6 +65,16 @@ class RobotBody:
             [arm.poses(self.values_of(arm, values)).matrix() for arm in self.arms]
         )
 
+    def slopes(self, values: Array) -> Array:
+        """(links, n, 6, k) motion of links by each value: translation, rotation; axes of links."""
+        slopes = np.zeros((len(self.arms), len(values), 6, len(self.joints)))
+        for number, arm in enumerate(self.arms):
+            own = arm.slopes(self.values_of(arm, values))
+            for column, name in enumerate(arm.joints):
+                if name in self.joints:
+                    slopes[number, ..., self.joints.index(name)] = own[..., column]
+        return slopes
+
     def values_of(self, arm: Arm, values: Array) -> Array:
         """(n, j) values of the joints of a chain; those without values stand at rest."""
         moved = np.tile(_rest(arm), (len(values), 1))

@@ -183,6 +183,18 @@ class ArmFit:
         return float(self.weights.sum() / max(self.equations.testable.sum(), 1))
 
 
+class Shown(NamedTuple):
+    """The arm in one image."""
+
+    number: int
+    """Of the image."""
+    base_from_link: Array
+    """(links, 4, 4)."""
+    slopes: Array
+    """(links, 6, k) see `RobotBody.slopes`."""
+    drawing: Drawing
+
+
 class Search(NamedTuple):
     """How outlines are searched in an image."""
 
@@ -221,17 +233,19 @@ class Fitter:
         """
         estimate = start
         for number, reach in enumerate(reaches_px):
-            frames = self._frames(estimate)
+            values = self.views.values + estimate.offsets
+            frames = self.views.body.frames(values)
+            slopes = self.views.body.slopes(values)
             drawings = [self.draw(estimate, frames[:, i]) for i in images]
             if number in learn_at:
                 self._learn(images, drawings, reach)
             edges = self._edges if learn_at else self._rough_edges
-            how = Search(edges, reach, spacing_px)
-            rows = [
-                self._rows(estimate, frames[:, i], i, drawing, how)
-                for i, drawing in zip(images, drawings, strict=True)
-            ]
-            equations = _joined(rows)
+            search = Search(edges, reach, spacing_px)
+            rows = []
+            for i, drawing in zip(images, drawings, strict=True):
+                shown = Shown(i, frames[:, i], slopes[:, i], drawing)
+                rows.append(self._rows(estimate, shown, search))
+            equations = Equations(*map(np.concatenate, zip(*rows, strict=True)))
             fit = solved(estimate, equations, priors)
             estimate = fit.estimate
             if learn_at and number >= max(learn_at):
@@ -256,9 +270,6 @@ class Fitter:
         pose = estimate.camera_from_base.matrix()
         return self._rasterizer.draw(pose @ base_from_link, estimate.camera)
 
-    def _frames(self, estimate: Estimate) -> Array:
-        return self.views.body.frames(self.views.values + estimate.offsets)
-
     def _learn(
         self, images: Sequence[int], drawings: Sequence[Drawing], reach: float
     ) -> None:
@@ -271,63 +282,56 @@ class Fitter:
             covered[i] = cv2.dilate(arm, np.ones((side, side), np.uint8)) > 0
         self.views.learn_background(covered)
 
-    def _rows(
-        self,
-        estimate: Estimate,
-        base_from_link: Array,
-        i: int,
-        drawing: Drawing,
-        how: "Search",
-    ) -> Equations:
+    def _rows(self, estimate: Estimate, shown: Shown, search: Search) -> Equations:
         """Residuals of one image."""
-        pose = estimate.camera_from_base.matrix()
         camera = estimate.camera
-        links = pose @ base_from_link
-        points = outline_points(how.edges, links, camera, drawing, how.spacing_px)
-        points = points.at(self.moving[points.link])
-        offsets = image_offsets(self.views, i, points, how.reach_px)
-        testable = np.bincount(
-            points.link[offsets.testable], minlength=len(self._edges)
+        links = estimate.camera_from_base.matrix() @ shown.base_from_link
+        points = outline_points(
+            search.edges, links, camera, shown.drawing, search.spacing_px
         )
+        points = points.at(self.moving[points.link])
+        offsets = image_offsets(self.views, shown.number, points, search.reach_px)
+        count = len(self._edges)
+        testable = np.bincount(points.link[offsets.testable], minlength=count)
         points = points.at(offsets.confirmed)
-        values = self.views.values[i] + estimate.offsets
-        slopes = self._slopes(points, camera, links, values)
         px = offsets.px[offsets.confirmed]
-        owner = np.full(len(px), i)
+        owner = np.full(len(px), shown.number)
+        by_link = links[:, :3, :3] @ shown.slopes.reshape(count, 2, 3, -1).swapaxes(
+            0, 1
+        )
+        slopes = outline_slopes(points, camera, links, by_link)
         return Equations(slopes, px, owner, points.link, testable[None])
 
-    def _slopes(
-        self, points: OutlinePoints, camera: Camera, links: Array, values: Array
-    ) -> Array:
-        """(m, 10 + k) motion along the normals by each parameter."""
-        body = self.views.body
-        x, y, z = points.in_camera.T
-        along = points.normals * [camera.fx, camera.fy]
-        depth = -(along[:, 0] * x + along[:, 1] * y) / z
-        by_point = np.stack([*along.T, depth], 1) / z[:, None]
-        slopes = np.zeros((len(z), JOINTS + len(body.joints)))
-        slopes[:, :3] = by_point
-        slopes[:, 3:6] = np.cross(points.in_camera, by_point)
-        from_centre = points.pixels - [camera.cx, camera.cy]
-        slopes[:, FOCAL] = (points.normals * from_centre).sum(1)
-        slopes[:, CENTRE] = points.normals
-        slopes[:, OUTLINE] = 1.0
-        for number in np.unique(points.link):
-            rows = points.link == number
-            arm = body.arms[number]
-            columns = [
-                body.joints.index(name) for name in arm.joints if name in body.joints
-            ]
-            own = [k for k, name in enumerate(arm.joints) if name in body.joints]
-            if not own:
-                continue
-            motion = arm.slopes(body.values_of(arm, values[None]))[0][:, own]
-            turned = np.cross(motion[3:].T, points.on_link[rows][:, None])
-            moved = (turned + motion[:3].T) @ links[number, :3, :3].T
-            slopes[np.ix_(rows, JOINTS + np.array(columns))] = np.einsum(
-                "mkc,mc->mk", moved, by_point[rows]
-            )
-        return slopes
+
+def outline_slopes(
+    points: OutlinePoints, camera: Camera, links: Array, by_joint: Array
+) -> Array:
+    """(m, 10 + k) motion along the normals of outlines by each parameter.
+
+    `links` (links, 4, 4) are poses in the camera, and `by_joint` (2, links, 3, k) their translation
+    and rotation by each joint value, in camera axes.
+    """
+    x, y, z = points.in_camera.T
+    along = points.normals * [camera.fx, camera.fy]
+    depth = -(along[:, 0] * x + along[:, 1] * y) / z
+    by_point = np.stack([*along.T, depth], 1) / z[:, None]
+    from_centre = points.pixels - [camera.cx, camera.cy]
+    focal = (points.normals * from_centre).sum(1)
+    shift, turn = by_joint[:, points.link]
+    lever = points.in_camera - links[points.link, :3, 3]
+    by_turn = np.cross(lever, by_point)
+    return np.concatenate(
+        [
+            by_point,
+            np.cross(points.in_camera, by_point),
+            focal[:, None],
+            points.normals,
+            np.ones((len(z), 1)),
+            np.einsum("mck,mc->mk", shift, by_point)
+            + np.einsum("mck,mc->mk", turn, by_turn),
+        ],
+        1,
+    )
 
 
 def moving_links(views: ArmViews) -> BoolArray:
@@ -344,10 +348,6 @@ def moving_links(views: ArmViews) -> BoolArray:
 
 _MOVES = 0.3
 """Least way of the middle of a link that moves, in its sizes."""
-
-
-def _joined(rows: Sequence[Equations]) -> Equations:
-    return Equations(*map(np.concatenate, zip(*rows, strict=True)))
 
 
 def solved(estimate: Estimate, equations: Equations, priors: Priors) -> ArmFit:

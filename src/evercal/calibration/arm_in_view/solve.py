@@ -43,8 +43,6 @@ _SLIDING_M = 0.5
 """Offset of a sliding joint for a radian of others."""
 WRONG_LENS = 0.02
 """Standard deviation of the focal length where the images contradict the stated one."""
-FIRST_STARTS = 4
-"""Starts that are fitted; the others only if none of them is confirmed."""
 SURE_CONFIRMED = 0.3
 """From here, no other start is tried."""
 SHORT_IMAGES = 10
@@ -192,7 +190,7 @@ def _best_start(
     best = None
     for number, pose in enumerate(poses):
         on_progress("trying starts", number, len(poses))
-        if number >= FIRST_STARTS and best and best.confirmed > SURE_CONFIRMED:
+        if best and best.confirmed > SURE_CONFIRMED:
             break
         try:
             fit = fitter.fit(
