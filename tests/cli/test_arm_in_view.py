@@ -1,10 +1,14 @@
 """`evercal arm-in-view`, its report, and `evercal check` of a camera by its arm."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from evercal.calibration.calibration import read_calibration
 from evercal.cli import main
+from evercal.geometry import SE3
 from tests import arm_cell
 
 
@@ -25,3 +29,41 @@ def test_the_report_draws_the_outline_of_the_arm(cell: Path) -> None:
         assert name in page
     assert "residual (deg)" not in page
     assert "--store MAP" not in page
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "words"),
+    [
+        ("", 0, ("No joint has changed", "The camera has not moved")),
+        ("camera", 1, ("No joint has changed", "The camera has moved by 2")),
+        ("joint", 1, ("Changed joints: shoulder (", "The camera has not moved")),
+    ],
+)
+def test_new_images_show_what_has_moved(
+    cell: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    change: str,
+    code: int,
+    words: tuple[str, ...],
+) -> None:
+    """The camera by 20 mm and more, or the zero of a joint by 0.6 deg."""
+    new = tmp_path / "new"
+    arm_cell.write(new, 6, seed=1)
+    reference = read_calibration(cell / "camera.json")
+    if change == "camera":
+        bump = SE3.exp([0.015, -0.015, 0, 0, 0, 0.01])
+        moved = reference.parent_from_child @ bump
+        reference = replace(reference, parent_from_child=moved)
+    if change == "joint":
+        names = ("image", *arm_cell.NAMES)
+        rows = np.loadtxt(new / "joints.csv", str, delimiter=",", skiprows=1)
+        rows[:, 2] = (rows[:, 2].astype(float) + 0.01).astype(str)
+        lines = [",".join(row) for row in (names, *rows.tolist())]
+        (new / "joints.csv").write_text("\n".join(lines))
+    file = tmp_path / "reference.json"
+    reference.write(file)
+    assert main(["check", str(new), "--reference", str(file)]) == code
+    output = capsys.readouterr().out
+    for sentence in words:
+        assert sentence in output

@@ -1,6 +1,6 @@
 """`evercal arm-in-view`."""
 
-from dataclasses import field
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -57,6 +57,8 @@ class ArmInView(args.Verb):
                 self.without,
                 on_progress=bars.step,
             )
+        source = {**calibration.source, "without": self.without}
+        calibration = replace(calibration, source=source)
         calibration.write(self.out)
         if self.report is not None:
             from evercal.reports.arm_pictures import arm_pictures

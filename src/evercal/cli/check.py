@@ -5,7 +5,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 from evercal.classes import frozen
 from evercal.cli import args
@@ -29,10 +29,16 @@ class Check(args.Verb):
     A reference with joint offsets and a new recording of the arm, with joint values: test which
     joints have changed. The recording is learned apart; the map stays as it is.
 
+    A recording in place of the map: by the robot arm in its images, three or more with joint
+    values. Without a map, any calibration of a fixed camera is tested so.
+
     Example: evercal check cell.evercal now.png --reference tripod.json
+
+    Example: evercal check new/ --reference camera.json --urdf robot.urdf
     """
 
-    store: args.Store
+    store: Annotated[Positional[Path], args.shown("MAP|RECORDING")]
+    """Folder of the map, or a recording of the arm in view."""
     images: args.ImageFiles
     """New images of one camera, or a folder of them; five or more reveal smaller shifts. Of an arm,
     a recording."""
@@ -57,6 +63,10 @@ class Check(args.Verb):
         from evercal.recordings.image_files import image_files
 
         reference = read_calibration(self.reference)
+        if not self.images:
+            if args.strategy_of(self.store):
+                raise InputError(f"{self.store}: is a map; give new images, too")
+            return self._check_by_arm(reference)
         on_arm = reference.on_gripper and reference.joints
         if on_arm or self.urdf is not None or self.gripper_frame is not None:
             return self._check_arm(reference)
@@ -84,30 +94,53 @@ class Check(args.Verb):
         return 1 if shift.moved else 0
 
     def _check_arm(self, reference: "Calibration") -> int:
-        from evercal.calibration.arm_change import arm_change
-        from evercal.calibration.drift import shift_of
         from evercal.map import Map
 
         if len(self.images) != 1 or self.robot_poses is not None:
             raise InputError(
                 "to check an arm, give one recording with joint values and no poses"
             )
-        reading = args.Reading(
-            camera=self.camera, gripper_frame=self.gripper_frame, urdf=self.urdf
-        )
-        recording = replace(reading, pose_convention=self.convention).recording(
-            self.images[0]
-        )
+        recording = self._reading().recording(self.images[0])
         with TemporaryDirectory() as folder:
             new = Map.open(Path(folder) / "map")
             learn = new.learn if reference.on_gripper else new.eye_to_hand
             learn(recording)
             now = new.calibration()
-        confidence, changed, joints = arm_change(reference, now)
+        return self._compared(reference, now)
+
+    def _reading(self) -> args.Reading:
+        return args.Reading(
+            camera=self.camera,
+            gripper_frame=self.gripper_frame,
+            urdf=self.urdf,
+            pose_convention=self.convention,
+        )
+
+    def _check_by_arm(self, reference: "Calibration") -> int:
+        from evercal.calibration.arm_in_view.again import calibrated_again
+        from evercal.recordings.formats.wrist import urdf_beside
+        from evercal.robot.robot_model import RobotModel
+
+        reading = replace(self._reading(), base_frame=reference.frames.base or None)
+        recording = reading.recording(self.store, whole_robot=True)
+        model = RobotModel(self.urdf or urdf_beside(self.store))
+        return self._compared(reference, calibrated_again(recording, model, reference))
+
+    def _compared(self, reference: "Calibration", now: "Calibration") -> int:
+        from evercal.calibration.arm_change import arm_change
+        from evercal.calibration.drift import shift_of
+
+        change = "No joint has changed."
+        try:
+            confidence, changed, joints = arm_change(reference, now)
+        except InputError as error:
+            if self.images:
+                raise
+            confidence, changed, joints = 0.0, [], []
+            change = f"Joints are not compared: {error}."
         shift = shift_of(
             reference, now.parent_from_child, reference.covariance + now.covariance
         )
-        change = "No joint has changed."
         if changed:
             names = ", ".join(changed)
             change = f"Changed joints: {names} (confidence {100 * confidence:.1f} %)."
@@ -121,7 +154,8 @@ class Check(args.Verb):
             "changed": changed,
             "joints": [*map(vars, joints)],
         }
-        self.answer({**record, "camera": shift_dict(shift)}, *lines)
+        warnings = map("warning: {}".format, now.checks.warnings or ())
+        self.answer({**record, "camera": shift_dict(shift)}, *lines, *warnings)
         return 1 if changed or shift.moved else 0
 
 

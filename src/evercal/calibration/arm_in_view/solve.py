@@ -166,7 +166,7 @@ def fit_arm(
             fit = fitter.fit(
                 fit.estimate, priors, every, reaches[-4:], _SPACING_PX, _LEARN_AT
             )
-    except TooFewPoints:
+    except (TooFewPoints, np.linalg.LinAlgError):
         raise InputError(NOT_RECOGNISED) from None
     if fit.confirmed < LEAST_CONFIRMED:
         raise InputError(

@@ -1,0 +1,23 @@
+"""`check` of a fixed camera by the arm in a few new images."""
+
+from evercal.calibration.arm_in_view.result import DOUBTFUL_CONFIRMED
+from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
+from evercal.calibration.calibration import Calibration
+from evercal.errors import InputError
+from evercal.recordings.frame import Recording
+from evercal.robot.robot_model import RobotModel
+
+
+def calibrated_again(
+    recording: Recording, model: RobotModel, reference: Calibration
+) -> Calibration:
+    """Calibrate a camera from its reference on; from nothing, if the images contradict that."""
+    without = reference.source.get("without", ())
+    start = reference.parent_from_child
+    try:
+        near = calibrate_arm_in_view(recording, model, None, without, start)
+        if (near.checks.outline_confirmed or 0) > DOUBTFUL_CONFIRMED:
+            return near
+    except InputError:
+        pass
+    return calibrate_arm_in_view(recording, model, None, without)
