@@ -1,5 +1,6 @@
 """`evercal arm-in-view`, its report, and `evercal check` of a camera by its arm."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,6 +30,35 @@ def test_the_report_draws_the_outline_of_the_arm(cell: Path) -> None:
         assert name in page
     assert "residual (deg)" not in page
     assert "--store MAP" not in page
+
+
+def test_inspect_names_the_method(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = str(cell / "recording")
+    assert main(["inspect", recording]) == 0
+    assert f"next: evercal arm-in-view {recording}" in capsys.readouterr().out
+
+
+def test_what_cannot_be_compared_is_refused(
+    cell: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A camera on the gripper, a map without images, an arm that stands still."""
+    still = tmp_path / "still"
+    shutil.copytree(cell / "recording", still)
+    header, first, *rows = (still / "joints.csv").read_text().splitlines()
+    values = first.partition(",")[2]
+    lines = [f"{row.partition(',')[0]},{values}" for row in (first, *rows)]
+    (still / "joints.csv").write_text("\n".join([header, *lines]))
+    on_arm = replace(read_calibration(cell / "camera.json"), mount="eye_in_hand")
+    file = tmp_path / "on_arm.json"
+    on_arm.write(file)
+    for words, message in (
+        (["check", str(still), "--reference", str(file)], "a camera on the gripper"),
+        (["arm-in-view", str(still)], "the arm does not move"),
+    ):
+        assert main(words) == 2
+        assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,7 @@ def check(
     base_from_gripper: SE3 | None = None,
 ) -> Shift:
     """Test whether a camera has moved since its calibration, see `Map.check`."""
-    _require_fixed(reference)
+    require_fixed(reference)
     localizer = within_reference(localizer, reference)
     located = locate(localizer, images, camera or reference.camera, on_image)
     if not shows_held_thing(localizer, located, base_from_gripper):
@@ -108,7 +108,7 @@ def shift_between(
     confidence: float = CONFIDENCE,
 ) -> Shift:
     """Compare `fused`, the pose of a camera now from `located` images, with its calibration."""
-    _require_fixed(reference)
+    require_fixed(reference)
     scene = localizer.contents.metric_scene(fused.scene)
     same = reference.source.get("map") == scene.digest
     count = int(fused.used.sum())
@@ -138,7 +138,8 @@ def within_reference(localizer: "Localizer", reference: Calibration) -> "Localiz
     return localizer
 
 
-def _require_fixed(reference: Calibration) -> None:
+def require_fixed(reference: Calibration) -> None:
+    """Refuse a camera on the gripper."""
     if reference.on_gripper:
         raise InputError(
             "the reference is a camera on the gripper, whose pose in the base changes with every"

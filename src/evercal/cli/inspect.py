@@ -58,9 +58,11 @@ class Inspect(args.Verb):
                 lines.append(f"warning: {open.sentence()}")
         if self.coverage or self.next is not None:
             self._advise(recording, record, lines)
-        self.answer(
-            record, *lines, then=("learn", "MAP", self.scene, *self.reading.words())
-        )
+        verb = ["learn", "MAP"]
+        if recording.arm and "evercal arm-in-view" in str(inspection.warnings):
+            verb = ["arm-in-view"]
+        then = [*verb, self.scene, *self.reading.words()]
+        self.answer(record, *lines, then=then)
         return 0
 
     def _advise(

@@ -3,6 +3,7 @@
 from evercal.calibration.arm_in_view.result import DOUBTFUL_CONFIRMED
 from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
 from evercal.calibration.calibration import Calibration
+from evercal.calibration.drift import require_fixed
 from evercal.errors import InputError
 from evercal.recordings.frame import Recording
 from evercal.robot.robot_model import RobotModel
@@ -12,6 +13,7 @@ def calibrated_again(
     recording: Recording, model: RobotModel, reference: Calibration
 ) -> Calibration:
     """Calibrate a camera from its reference on; from nothing, if the images contradict that."""
+    require_fixed(reference)
     without = reference.source.get("without", ())
     start = reference.parent_from_child
     try:

@@ -20,6 +20,7 @@ from evercal.calibration.arm_in_view.outline import (
 from evercal.calibration.arm_in_view.rasterizer import Drawing, Rasterizer
 from evercal.calibration.arm_in_view.views import ArmViews
 from evercal.classes import frozen_arrays
+from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.typing import Array, BoolArray, IntArray
 
@@ -211,6 +212,8 @@ class Fitter:
     def __init__(self, views: ArmViews) -> None:
         self.views = views
         self.moving = moving_links(views)
+        if not self.moving.any():
+            raise InputError("the arm does not move; record it at poses far apart")
         shapes = views.body.links
         rough = [shape.simplified(_ROUGH * self.reach_m()) for shape in shapes]
         self._rasterizer = Rasterizer(rough)

@@ -150,8 +150,6 @@ def fit_arm(
         InputError: The arm does not move, or the images do not show it where it should be.
     """
     views = fitter.views
-    if not fitter.moving.any():
-        raise InputError("the arm does not move; record it at poses far apart")
     zoom = max(views.size) / 640
     if start is None:
         best = _best_start(fitter, priors, zoom, on_progress).estimate

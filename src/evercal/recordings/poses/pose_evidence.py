@@ -68,8 +68,9 @@ def rotation_warnings(
         angles = norms(measured)
         if np.rad2deg(np.median(angles)) < STILL_DEG:
             return [
-                "the gripper rotates and the images hardly do; does the camera stand still, or are"
-                " the angles in another unit than stated?"
+                "the gripper rotates and the images hardly do; does the camera stand still"
+                " ('evercal arm-in-view' and 'evercal eye-to-hand' calibrate it), or are the angles"
+                " in another unit than stated?"
             ]
         owner = "gripper"
         error_of = _fitted_error_deg  # a fixed rotation to the camera is not known
