@@ -21,6 +21,7 @@ from evercal.calibration.transform_file import read_transform
 from evercal.cli import main
 from evercal.geometry import SE3, pose_distance_mm_deg
 from evercal.recordings import generic, samples
+from tests import arm_cell
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "tutorials"
@@ -179,6 +180,17 @@ def test_a_camera_beside_the_robot(tmp_path: Path) -> None:
         assert pose_distance_mm_deg(read_transform(tmp_path / name), true)[0] < 2
 
 
+def test_the_arm_alone(tmp_path: Path) -> None:
+    arm_cell.write(tmp_path / "recording")
+    arm_cell.write(tmp_path / "new", 5, seed=1)
+    printed = run(text_of("arm-in-view"), tmp_path)
+    assert "The camera has not moved" in printed
+    assert "No joint has changed" in printed
+    pose = read_transform(tmp_path / "camera.json")
+    assert pose_distance_mm_deg(pose, arm_cell.BASE_FROM_CAMERA)[0] < 2
+    assert (tmp_path / "camera.html").is_file()
+
+
 @pages
 def test_a_method_of_your_own(tmp_path: Path) -> None:
     assert "mine" in run(text_of("own-method"), tmp_path)
@@ -197,5 +209,5 @@ def test_steps_are_read_in_order() -> None:
 
 
 def test_every_page_has_a_test() -> None:
-    tested = {"fixed-camera", "own-method"}
+    tested = {"fixed-camera", "arm-in-view", "own-method"}
     assert {path.stem for path in PAGES.glob("*.md")} == tested

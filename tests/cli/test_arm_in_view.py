@@ -10,6 +10,7 @@ import pytest
 from evercal.calibration.calibration import read_calibration
 from evercal.cli import main
 from evercal.geometry import SE3
+from evercal.robot.frame_names import FrameNames
 from tests import arm_cell
 
 
@@ -30,6 +31,39 @@ def test_the_report_draws_the_outline_of_the_arm(cell: Path) -> None:
         assert name in page
     assert "residual (deg)" not in page
     assert "--store MAP" not in page
+
+
+def test_a_report_without_the_recording_names_the_command(
+    cell: Path, tmp_path: Path
+) -> None:
+    images = str(cell / "recording")
+    words = ["report", str(cell / "camera.json"), "--images", images, "--out"]
+    assert main([*words, str(tmp_path / "r.html")]) == 0
+    page = (tmp_path / "r.html").read_text("utf-8")
+    assert "with --report" in page
+    assert "--store MAP" not in page
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_compare_with_a_calibration_by_a_board(
+    cell: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], *, named: bool
+) -> None:
+    """Another origin, 50 mm beside it; frames with names, and without."""
+    ours = read_calibration(cell / "camera.json")
+    bump = SE3.exp([0.05, 0, 0, 0, 0, 0])
+    board = replace(
+        ours,
+        parent_from_child=ours.parent_from_child @ bump,
+        frames=ours.frames if named else FrameNames(),
+        joints=(),
+        joint_covariance=np.zeros((0, 0)),
+        source={"command": "solve"},
+    )
+    files = [str(cell / "camera.json"), str(tmp_path / "board.json")]
+    board.write(files[1])
+    assert main(["compare", *files]) == 1
+    assert "50.00 mm" in capsys.readouterr().out
+    assert main(["compare", files[0], files[0]]) == 0
 
 
 def test_inspect_names_the_method(
