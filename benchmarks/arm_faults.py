@@ -77,9 +77,11 @@ def _half(cell: Cell, _: float, __: Generator) -> None:
 
 
 def _joints(cell: Cell, deg: float, rng: Generator) -> None:
+    """Offsets of all joints but the first, whose zero is the base's."""
     names = ARMS[cell.arm].joints
     slides = [name == "slide" or "finger" in name for name in names]
     offsets = np.deg2rad(deg) * rng.normal(size=len(names))
+    offsets[0] = 0
     cell.joints = cell.joints + np.where(slides, 0.0, offsets)
 
 
