@@ -4,11 +4,20 @@ from pathlib import Path
 
 import pytest
 
-from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
+from evercal.calibration.arm_in_view.fit import Fitter
+from evercal.calibration.arm_in_view.solve import (
+    calibrate_arm_in_view,
+    chosen_frames,
+    fit_arm,
+    priors_of,
+)
+from evercal.calibration.arm_in_view.views import ArmViews
 from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
-from evercal.geometry import pose_distance_mm_deg
+from evercal.geometry import SE3, pose_distance_mm_deg
 from evercal.recordings import ReadOptions, load_recording
+from evercal.robot.link_shapes import robot_body
+from evercal.robot.pose_errors import ArmErrors
 from evercal.robot.robot_model import RobotModel
 from tests import arm_cell
 
@@ -53,3 +62,14 @@ def test_joint_values_of_other_images_are_refused(cell: Path, tmp_path: Path) ->
     (folder / "joints.csv").write_text("\n".join([header, *mixed]))
     with pytest.raises(InputError, match="do the joint values belong"):
         _calibrated(folder)
+
+
+def test_the_arm_may_leave_the_image(cell: Path) -> None:
+    """A camera that sees none of it refuses."""
+    options = ReadOptions(whole_robot=True)
+    recording = load_recording(cell, None, None, options)
+    away = arm_cell.BASE_FROM_CAMERA @ SE3.exp([0, 0, 0, 0, 3, 0])
+    body = robot_body(RobotModel(cell / "robot.urdf"), arm_cell.NAMES)
+    fitter = Fitter(ArmViews.of(chosen_frames(recording), body))
+    with pytest.raises(InputError, match="not recognised"):
+        fit_arm(fitter, priors_of(body, ArmErrors()), away)

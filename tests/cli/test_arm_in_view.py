@@ -99,6 +99,11 @@ def test_what_cannot_be_compared_is_refused(
     ("change", "code", "words"),
     [
         ("", 0, ("No joint has changed", "The camera has not moved")),
+        (
+            "urdf",
+            1,
+            ("The camera has moved", "is this the URDF of the arm as it is now"),
+        ),
         ("camera", 1, ("No joint has changed", "The camera has moved by 2")),
         ("joint", 1, ("Changed joints: shoulder (", "The camera has not moved")),
     ],
@@ -111,7 +116,7 @@ def test_new_images_show_what_has_moved(
     code: int,
     words: tuple[str, ...],
 ) -> None:
-    """The camera by 20 mm and more, or the zero of a joint by 0.6 deg."""
+    """The camera by 20 mm and more, the zero of a joint by 0.6 deg, or a longer link."""
     new = tmp_path / "new"
     arm_cell.write(new, 6, seed=1)
     reference = read_calibration(cell / "camera.json")
@@ -119,6 +124,9 @@ def test_new_images_show_what_has_moved(
         bump = SE3.exp([0.015, -0.015, 0, 0, 0, 0.01])
         moved = reference.parent_from_child @ bump
         reference = replace(reference, parent_from_child=moved)
+    if change == "urdf":
+        text = (new / "robot.urdf").read_text().replace("0 0 0.32", "0 0 0.36")
+        (new / "robot.urdf").write_text(text)
     if change == "joint":
         names = ("image", *arm_cell.NAMES)
         rows = np.loadtxt(new / "joints.csv", str, delimiter=",", skiprows=1)

@@ -21,6 +21,9 @@ Reference = Annotated[
     Path, arg(metavar="FILE", help="The camera's calibration from 'evercal calibrate'.")
 ]
 
+_SCATTER = 2.0
+"""Outlines scatter by this many times as much before a wrong URDF."""
+
 
 @frozen
 class Check(args.Verb):
@@ -154,8 +157,15 @@ class Check(args.Verb):
             "changed": changed,
             "joints": [*map(vars, joints)],
         }
-        warnings = map("warning: {}".format, now.checks.warnings or ())
-        self.answer({**record, "camera": shift_dict(shift)}, *lines, *warnings)
+        lines += map("warning: {}".format, now.checks.warnings or ())
+        px = now.checks.outline_sigma_px or 0
+        before = reference.checks.outline_sigma_px or px
+        if px > _SCATTER * before:
+            lines.append(
+                f"warning: outlines scatter by {px:.2f} px, {before:.2f} px in the reference: is"
+                " this the URDF of the arm as it is now, and the lens the same?"
+            )
+        self.answer({**record, "camera": shift_dict(shift)}, *lines)
         return 1 if changed or shift.moved else 0
 
 

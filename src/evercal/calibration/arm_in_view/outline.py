@@ -163,6 +163,9 @@ def image_offsets(
     views: ArmViews, i: int, points: OutlinePoints, reach_px: float
 ) -> Offsets:
     """Find where image `i` ends to differ from the background, along the normals of points."""
+    if not len(points.link):  # the arm is beside the image
+        none = np.zeros(0)
+        return Offsets(none, none > 0, none > 0, none)
     step = 1.0 if reach_px > _FINE_PX else 0.5
     end = reach_px + _AROUND
     along = np.arange(-end, end + step / 2, step)
