@@ -5,9 +5,12 @@ one link its mesh. So the residuals count as clusters of images and of links (sa
 What all images share, the priors of the fit hold: each is a part of its own.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from evercal.calibration.arm_in_view.fit import (
+    FOCAL,
     JOINTS,
     LEAST_REPEATS,
     LENS,
@@ -26,6 +29,11 @@ _SHARED = {
 """Parameters with a prior, by the name of their part, and its cause."""
 SCATTER = "scatter of the outlines"
 """Name of the part of the residuals."""
+ESTIMATED_FOCAL = 0.003
+"""Standard deviation of the logarithm of a focal length that outlines alone tell: errors of meshes
+and light that all images share."""
+WRONG_LENS = 0.02
+"""Standard deviation of the logarithm of the focal length where the stated one is wrong."""
 
 
 def parts(fit: ArmFit, free: BoolArray | None = None) -> dict[str, tuple[Array, str]]:
@@ -37,8 +45,9 @@ def parts(fit: ArmFit, free: BoolArray | None = None) -> dict[str, tuple[Array, 
     lens = np.zeros((3, 3))
     if free is None:
         free = fit.free
-        if not free[LENS].any():
-            lens = lens_covariance(fit)
+        lens = lens_covariance(fit)
+        if fit.estimate.parameters[FOCAL]:
+            lens[0, 0] += ESTIMATED_FOCAL**2
     columns = np.flatnonzero(free)
     inverse = np.linalg.inv(fit.normal(free))
     sigma = fit.priors.sigma()
@@ -61,17 +70,11 @@ def lens_covariance(fit: ArmFit) -> Array:
     return sum(part for part, _ in parts(fit, _with_lens(fit)).values())[LENS, LENS]
 
 
-def lens_is_wrong(fit: ArmFit) -> bool:
-    """Whether the images contradict the stated focal length."""
-    focal = fit.step(_with_lens(fit))[LENS][0]
-    sigma = float(np.sqrt(lens_covariance(fit)[0, 0]))
-    return abs(focal) > max(WRONG_SIGMAS * sigma, WRONG_FOCAL)
-
-
-WRONG_SIGMAS = 3.0
-"""Change of the focal length in standard deviations from which it is estimated."""
-WRONG_FOCAL = 0.003
-"""Smaller changes do not count."""
+def focal_sigmas(fit: ArmFit) -> float:
+    """Change of the focal length that the images ask for, in its standard deviations."""
+    fit = replace(fit, priors=replace(fit.priors, focal=WRONG_LENS))
+    step = fit.step(_with_lens(fit)) + fit.estimate.parameters
+    return abs(step[FOCAL]) / float(np.sqrt(lens_covariance(fit)[0, 0]))
 
 
 def _with_lens(fit: ArmFit) -> BoolArray:

@@ -51,8 +51,10 @@ class Priors:
     """Of the principal point."""
     outline_px: float = 0.25
     """Of a common shift of all outlines: light, blur, simplified meshes."""
-    joints: Array = field(default_factory=lambda: np.zeros(0))
+    usual: Array = field(default_factory=lambda: np.zeros(0))
     """(k,) of the offsets of joint values; 0 of those that are not estimated."""
+    size: float = 1.0
+    """Size of the offsets of this arm, in usual ones."""
     lens_is_free: bool = False
     """Whether focal length and principal point are estimated. If not, their errors count all the
     same: a right lens is known better than an arm tells it."""
@@ -63,7 +65,7 @@ class Priors:
         """(10 + k,) of all parameters; infinite of the pose."""
         pose = np.full(6, np.inf)
         shared = [self.focal, self.centre_px, self.centre_px, self.outline_px]
-        return np.concatenate([pose, shared, self.joints])
+        return np.concatenate([pose, shared, self.size * self.usual])
 
     def free(self) -> BoolArray:
         """(10 + k,) whether a parameter is estimated."""
@@ -72,20 +74,19 @@ class Priors:
         free[POSE.stop :] &= not self.pose_only
         return free
 
-    def widened(self, fit: "ArmFit") -> Self:
-        """With joint offsets of the size that they have, where that is larger.
+    def of_this_arm(self, fit: "ArmFit") -> Self:
+        """With joint offsets of the size that they have in a fit.
 
-        The size is estimated as by D. MacKay, Bayesian interpolation, 1992.
+        The size is estimated as by D. MacKay, Bayesian interpolation, 1992; the usual one counts as
+        one joint.
         """
-        free = np.flatnonzero(fit.free)
+        offsets = self.usual > 0
         variance = np.zeros(len(fit.free))
-        variance[free] = np.diag(np.linalg.inv(fit.normal()))
+        variance[fit.free] = np.diag(np.linalg.inv(fit.normal()))
         squares = fit.estimate.parameters**2 + variance
-        offsets = self.joints > 0
-        if not offsets.any():
-            return self
-        ratio = squares[JOINTS:][offsets] / self.joints[offsets] ** 2
-        return replace(self, joints=self.joints * max(1, np.sqrt(ratio.mean())))
+        ratios = squares[JOINTS:][offsets] / self.usual[offsets] ** 2
+        size = np.sqrt((1 + ratios.sum()) / (1 + len(ratios)))
+        return replace(self, size=float(size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,8 +232,8 @@ class Fitter:
     ) -> ArmFit:
         """Fit the outlines of images.
 
-        In the steps of `learn_at` the background is learned again; after them, priors become as
-        wide as the images ask for.
+        In the steps of `learn_at` the background is learned again; after them, the size of joint
+        offsets is estimated.
         """
         estimate = start
         for number, reach in enumerate(reaches_px):
@@ -252,7 +253,7 @@ class Fitter:
             fit = solved(estimate, equations, priors)
             estimate = fit.estimate
             if learn_at and number >= max(learn_at):
-                priors = priors.widened(fit)
+                priors = priors.of_this_arm(fit)
         return fit
 
     def reach_m(self) -> float:

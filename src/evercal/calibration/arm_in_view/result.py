@@ -44,6 +44,9 @@ def calibration_of(
         ErrorTerm.of(name, in_base(fit, part), cause)
         for name, (part, cause) in whole.items()
     ]
+    for name, added in _turns_of_base(fit, fitter).items():
+        of_pose = of_pose + added
+        terms.append(ErrorTerm.of(f"offset of joint {name}", added, "arm"))
     apart = halves(fit)
     # Halves differ by twice the error of the whole.
     d2 = apart @ np.linalg.pinv(4 * _of_images(fit, whole)) @ apart
@@ -79,6 +82,25 @@ def with_verdict(calibration: Calibration, warnings: Sequence[str]) -> Calibrati
 def _of_images(fit: ArmFit, whole: dict[str, tuple[Array, str]]) -> Array:
     scatter, _ = whole[SCATTER]
     return scatter[:6, :6]
+
+
+def _turns_of_base(fit: ArmFit, fitter: Fitter) -> dict[str, Array]:
+    """Covariances (6, 6) by the joints that turn the arm as a whole, and so no image shows."""
+    base_from_camera = fit.estimate.camera_from_base.inverse()
+    rotation = base_from_camera.rotation_matrix()
+    found = {}
+    for arm in fitter.views.body.arms:
+        if not arm.chain:
+            continue
+        joint = arm.chain[0]
+        sigma = fit.priors.size * fit.priors.usual.max()
+        axis = joint.before[:3, :3] @ joint.axis
+        lever = base_from_camera.translation_m - joint.before[:3, 3]
+        motion = np.concatenate([np.cross(axis, lever), axis @ rotation])
+        if not joint.rotates:
+            motion = np.concatenate([axis, np.zeros(3)])
+        found[arm.joints[joint.value]] = np.outer(motion, motion) * sigma**2
+    return found
 
 
 def _uses(fit: ArmFit, frames: Sequence[Frame]) -> tuple[ImageUse, ...]:
@@ -120,7 +142,7 @@ def _joints(fit: ArmFit, fitter: Fitter, covariance: Array) -> tuple[JointOffset
     rows = []
     for k, name in enumerate(body.joints):
         why = ""
-        prior = fit.priors.joints[k]
+        prior = fit.priors.sigma()[JOINTS + k]
         sigma = float(np.sqrt(covariance[JOINTS + k, JOINTS + k]))
         if not prior:
             why = "its offset turns the frame of the base: a mark at its zero shows it"

@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from evercal.calibration.arm_in_view.covariance import lens_is_wrong
+from evercal.calibration.arm_in_view.covariance import WRONG_LENS, focal_sigmas
 from evercal.calibration.arm_in_view.fit import (
     ArmFit,
     Fitter,
     Priors,
     TooFewPoints,
+    solved,
 )
 from evercal.calibration.arm_in_view.result import (
     LEAST_CONFIRMED,
@@ -41,8 +42,10 @@ MOST_IMAGES = 40
 """Images that are used; more of them are chosen by the motion of the joints."""
 _SLIDING_M = 0.5
 """Offset of a sliding joint for a radian of others."""
-WRONG_LENS = 0.02
-"""Standard deviation of the focal length where the images contradict the stated one."""
+DOUBTFUL_LENS = 1.8
+"""Change of the focal length, in standard deviations, from which its estimation is tried."""
+CONTRADICTED_LENS = 4.0
+"""The same after that, from which it is kept."""
 SURE_CONFIRMED = 0.3
 """From here, no other start is tried."""
 SHORT_IMAGES = 10
@@ -135,7 +138,7 @@ def priors_of(body: RobotBody, errors: ArmErrors) -> Priors:
                 rad = errors.offset_rad(np.zeros((1, 6, 1)))
                 lever_m = 1.0 if joint.rotates else _SLIDING_M
                 sigma[body.joints.index(name)] = rad * lever_m
-    return Priors(joints=sigma)
+    return Priors(usual=sigma)
 
 
 def fit_arm(
@@ -159,11 +162,14 @@ def fit_arm(
     reaches = [zoom * reach for reach in _FINAL_PX]
     try:
         fit = fitter.fit(best, priors, every, reaches, _SPACING_PX, _LEARN_AT)
-        if lens_is_wrong(fit):
-            priors = replace(priors, lens_is_free=True, focal=WRONG_LENS)
-            fit = fitter.fit(
-                fit.estimate, priors, every, reaches[-4:], _SPACING_PX, _LEARN_AT
+        if focal_sigmas(fit) > DOUBTFUL_LENS:
+            unknown = replace(priors, lens_is_free=True, focal=WRONG_LENS)
+            other = fitter.fit(
+                fit.estimate, unknown, every, reaches[-4:], _SPACING_PX, _LEARN_AT[:1]
             )
+            if focal_sigmas(other) > CONTRADICTED_LENS:
+                known = replace(other.priors, lens_is_free=False)
+                fit = solved(other.estimate, other.equations, known)
     except (TooFewPoints, np.linalg.LinAlgError):
         raise InputError(NOT_RECOGNISED) from None
     if fit.confirmed < LEAST_CONFIRMED:
