@@ -1,6 +1,7 @@
 """Types of arrays by element, of paths and of records."""
 
 import os
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -22,3 +23,15 @@ Strings: TypeAlias = tuple[str, ...]
 """Names or sentences."""
 JsonObject: TypeAlias = dict[str, Any]
 """Values of JSON by name."""
+Record: TypeAlias = Mapping[str, Any]
+"""The same, for reading alone."""
+Floats: TypeAlias = tuple[float, ...]
+"""Numbers."""
+Pair: TypeAlias = tuple[float, float]
+"""Two numbers, such as millimetres and degrees."""
+Triple: TypeAlias = tuple[float, float, float]
+"""Three numbers, such as x, y and z."""
+Size: TypeAlias = tuple[int, int]
+"""Width and height in pixels; of a grid, rows and columns."""
+ArrayPair: TypeAlias = tuple[Array, Array]
+"""Two arrays."""

@@ -38,7 +38,7 @@ from evercal.robot.mount import MountName, mount_named
 from evercal.storage import write_json
 from evercal.storage.provenance import Made, current, now
 from evercal.storage.records import of_format, read_record
-from evercal.typing import Array, JsonObject, PathLike
+from evercal.typing import Array, JsonObject, PathLike, Record
 
 if TYPE_CHECKING:
     from evercal.calibration.comparison import Comparison
@@ -98,11 +98,11 @@ class Calibration(FramedPose):
     """What it was compared with."""
     verdict: str = ""
     """Uses that it serves, one or two sentences."""
-    source: Mapping[str, Any] = field(default_factory=dict)
+    source: Record = field(default_factory=dict)
     """Command, store, scene and options, JSON values."""
     created: str = field(default_factory=now)
     """ISO 8601 time with zone."""
-    verifications: tuple[Mapping[str, Any], ...] = ()
+    verifications: tuple[Record, ...] = ()
     """Tests by data that it had not seen, see `Verification.to_dict`."""
     made: Made | None = field(default_factory=current)
     """Version, command and inputs; None in files of older versions."""
@@ -195,7 +195,7 @@ class Calibration(FramedPose):
         return of_format(data, FORMAT, VERSION, cls._from_mapping)
 
     @classmethod
-    def _from_mapping(cls, data: Mapping[str, Any]) -> Self:
+    def _from_mapping(cls, data: Record) -> Self:
         if data.get("mount") not in get_args(MountName):
             raise ValueError(
                 f"'mount' is one of {get_args(MountName)}, got {data.get('mount')!r}"
@@ -277,7 +277,7 @@ class Calibration(FramedPose):
         return export_files(self, format, path, **options).text
 
 
-def _names_in(data: Mapping[str, Any]) -> FrameNames:
+def _names_in(data: Record) -> FrameNames:
     """The names of a file; older ones state parent and child, by name or by the words for them."""
     stated = {
         mount_named(data["mount"]).parent: data["parent_frame"],

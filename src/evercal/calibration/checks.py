@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, Self
+from typing import Self
+
+from evercal.typing import JsonObject, Record
 
 Numbers = Mapping[str, float]
-Pose = Mapping[str, Any]
+Pose = Record
 """JSON values of a pose, see `geometry.pose_to_dict`."""
 
 
@@ -67,10 +69,10 @@ class Checks:
     """Share of the outline of an arm that the images show, 0 to 1."""
     outline_sigma_px: float | None = None
     """Robust standard deviation of the outlines."""
-    other: Mapping[str, Any] = field(default_factory=dict)
+    other: Record = field(default_factory=dict)
     """Values of files that other programs wrote."""
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return JSON values; those that are None are left out."""
         values = dict(vars(self))
         other = values.pop("other")
@@ -78,7 +80,7 @@ class Checks:
         return {**known, **other}
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+    def from_dict(cls, values: Record) -> Self:
         """The inverse of `to_dict`."""
         names = {item.name for item in fields(cls)} - {"other"}
         known = {name: value for name, value in values.items() if name in names}

@@ -17,7 +17,7 @@ from evercal.errors import InputError
 from evercal.geometry import axis_deviation, length_mm_deg, norms
 from evercal.geometry.rays import angles, fit_rays
 from evercal.robot.mount import mount_named
-from evercal.typing import Array, JsonObject, Strings
+from evercal.typing import Array, JsonObject, Pair, Strings
 
 USUAL_DISTANCE_M = 0.5
 """Working distance where none is stated: from a wrist camera to a table."""
@@ -49,10 +49,10 @@ class Comparison:
 
     distance_m: float
     """Working distance."""
-    rays_deg: tuple[float, float]
+    rays_deg: Pair
     """Angle between rays over the middle of the image: median, and 90 % are below. Without
     intrinsics, that of the optical axes."""
-    rays_mm: tuple[float, float]
+    rays_mm: Pair
     """Distance of points at the working distance: median, and 90 % are below."""
     pose_mm: float
     """Distance of the camera positions."""
@@ -210,6 +210,6 @@ def _cause(first: FramedPose, error: Array, information: Array) -> str:
     return _CAUSES[int(np.argmin(scores))].format(mount_named(first.mount).parent)
 
 
-def _spread(values: Array) -> tuple[float, float]:
+def _spread(values: Array) -> Pair:
     median, most = np.quantile(values, (0.5, 0.9)).tolist()
     return median, most

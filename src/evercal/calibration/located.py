@@ -23,7 +23,7 @@ from evercal.geometry.rays import fit_rays
 from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.localization.pictures import localize_picture
 from evercal.recordings.images import Picture
-from evercal.typing import Array, BoolArray
+from evercal.typing import Array, BoolArray, Pair
 
 if TYPE_CHECKING:
     from evercal.localization.estimate import PoseEstimate
@@ -224,7 +224,7 @@ def _far(off: Array) -> BoolArray:
     ).any(1)
 
 
-def halves_apart(poses: SE3) -> tuple[float, float] | None:
+def halves_apart(poses: SE3) -> Pair | None:
     """Return millimetres and degrees between the means of even and odd poses, at least four."""
     if len(poses) < 4:
         return None

@@ -6,6 +6,7 @@ import numpy as np
 
 from evercal.calibration.calibration import Calibration
 from evercal.geometry import cross_matrix
+from evercal.typing import Pair
 
 
 class Tier(NamedTuple):
@@ -33,7 +34,7 @@ def tier(calibration: Calibration) -> Tier | None:
     return None
 
 
-def expected_error(calibration: Calibration) -> tuple[float, float]:
+def expected_error(calibration: Calibration) -> Pair:
     """Return the root mean square error in space, millimetres and degrees.
 
     The position counts at the distance of the target along the optical axis (`target_m` of the

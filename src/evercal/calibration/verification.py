@@ -17,7 +17,7 @@ from evercal.classes import frozen
 from evercal.geometry import norms
 from evercal.robot.pose_errors import ArmErrors
 from evercal.storage.provenance import now
-from evercal.typing import Array, JsonObject
+from evercal.typing import Array, JsonObject, Triple
 
 Verdict = Literal["honest", "not as stated", "cannot tell"]
 _QUANTILES = (0.01, 0.5, 0.95)
@@ -70,7 +70,7 @@ class Verification:
     """Root mean square error of these places as the calibration states it."""
     d2: float
     """Squared Mahalanobis distance of the residuals, 6 or less for one that errs as it states."""
-    factor: tuple[float, float, float]
+    factor: Triple
     """True errors over stated ones: the 1 %, 50 % and 95 % quantile."""
     causes: Mapping[str, float]
     """Probabilities of errors that would explain the residuals, if they are not as stated."""
@@ -152,7 +152,7 @@ def judge(
     )
 
 
-def _factor(squares: Array, own: Array) -> tuple[float, float, float]:
+def _factor(squares: Array, own: Array) -> Triple:
     """Quantiles of the true errors over the stated ones."""
     variance = 1 + np.outer(_FACTORS**2, own)
     costs = (np.log(variance) + squares / variance).sum(1) / 2

@@ -22,6 +22,7 @@ from evercal.continual.methods.penalties import (
 from evercal.continual.methods.preconditioning import PreconditionedReplay
 from evercal.continual.methods.replay import Replay
 from evercal.errors import InputError
+from evercal.typing import JsonObject, Strings
 
 
 @frozen
@@ -44,9 +45,9 @@ class Strategy:
             return self.source
         return self.method.citation
 
-    def description(self) -> dict[str, object]:
+    def description(self) -> JsonObject:
         """Convert to plain data: method with hyper-parameters, map, joint training."""
-        record: dict[str, object] = {"method": None, "map": self.method is None}
+        record: JsonObject = {"method": None, "map": self.method is None}
         if self.method is not None:
             record["method"] = described(self.method)
         if self.jointly:
@@ -108,7 +109,7 @@ def strategy_named(name: str) -> Strategy:
     return STRATEGIES[name]
 
 
-def load_plugin(path: Path) -> tuple[str, ...]:
+def load_plugin(path: Path) -> Strings:
     """Run a Python file, add the strategies of its dict `STRATEGIES`, and return their names."""
     spec = importlib.util.spec_from_file_location(f"evercal_plugin_{path.stem}", path)
     if not path.is_file() or spec is None or spec.loader is None:

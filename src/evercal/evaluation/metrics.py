@@ -17,9 +17,9 @@ from evercal.choices import Status
 from evercal.classes import frozen
 from evercal.geometry import SE3
 from evercal.geometry.near import COARSE
-from evercal.typing import BoolArray, JsonObject
+from evercal.typing import BoolArray, JsonObject, Pair
 
-Thresholds = tuple[float, float]
+Thresholds = Pair
 """Errors of position in metres and of rotation in radians, below which a pose is correct."""
 MIDDLE: Thresholds = (0.02, math.radians(2.0))
 """2 cm and 2 deg, for one room."""

@@ -27,7 +27,7 @@ from evercal.geometry.distortion import (
     widest_fisheye,
     widest_pinhole,
 )
-from evercal.typing import Array, JsonObject, Strings
+from evercal.typing import Array, ArrayPair, Floats, JsonObject, Strings
 
 COEFFICIENTS: dict[str, Strings] = {
     "pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
@@ -66,7 +66,7 @@ class Camera:
     """Principal point in pixels; 0 is the centre of the leftmost pixel."""
     cy: float
     """Principal point in pixels; 0 is the centre of the topmost pixel."""
-    distortion: tuple[float, ...] = ()
+    distortion: Floats = ()
     """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]; empty without distortion. Zeros become empty.
     Of a fisheye k1 k2 k3 k4, also zeros."""
     model: CameraModel = "pinhole"
@@ -109,7 +109,7 @@ class Camera:
         matrix: ArrayLike,
         width: int,
         height: int,
-        distortion: tuple[float, ...] = (),
+        distortion: Floats = (),
     ) -> Self:
         """Convert a 3x3 intrinsic matrix without skew."""
         k = np.asarray(matrix, float)
@@ -132,7 +132,7 @@ class Camera:
         )
 
     @property
-    def coefficients(self) -> tuple[float, ...]:
+    def coefficients(self) -> Floats:
         """All eight distortion coefficients; missing ones are 0."""
         return (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
 
@@ -251,7 +251,7 @@ class Camera:
         depth = np.ones((*plane.shape[:-1], 1))
         return np.concatenate([plane, depth], axis=-1)
 
-    def slopes(self, plane: ArrayLike, terms: int = 2) -> tuple[Array, Array]:
+    def slopes(self, plane: ArrayLike, terms: int = 2) -> ArrayPair:
         """Derivatives of pixels by ideal points (..., 2) of the plane z = 1, and by intrinsics.
 
         The first are (..., 2, 2). The others are (..., 2, 3 + terms): by the logarithm of both
@@ -322,9 +322,7 @@ class Camera:
             model=model,
         )
 
-    def _distorted(
-        self, x: Array, y: Array
-    ) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
+    def _distorted(self, x: Array, y: Array) -> tuple[ArrayPair, tuple[Array, ...]]:
         """Distorted points (u, v), and their derivatives du/dx, du/dy = dv/dx and dv/dy."""
         xx = x * x
         yy = y * y

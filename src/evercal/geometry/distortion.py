@@ -10,7 +10,7 @@ from numpy.polynomial import Polynomial
 from numpy.polynomial.polynomial import polyroots
 from numpy.typing import ArrayLike
 
-from evercal.typing import Array
+from evercal.typing import Array, ArrayPair, Floats
 
 FISHEYE_DEG = 85.0
 """Largest angle to the optical axis of a ray of a fisheye."""
@@ -22,7 +22,7 @@ USUAL_DISTORTION = {
 many state no distortion."""
 
 
-def radial_pinhole(coefficients: tuple[float, ...], r2: Array) -> tuple[Array, Array]:
+def radial_pinhole(coefficients: Floats, r2: Array) -> ArrayPair:
     """Distorted over ideal radius, and its derivative by the ideal squared radius `r2`."""
     k1, k2, _, _, k3, k4, k5, k6 = coefficients
     above = k2 + r2 * k3
@@ -41,7 +41,7 @@ def radial_pinhole(coefficients: tuple[float, ...], r2: Array) -> tuple[Array, A
     return radial, (steeper - radial * change) / below
 
 
-def radial_fisheye(coefficients: tuple[float, ...], r2: Array) -> tuple[Array, Array]:
+def radial_fisheye(coefficients: Floats, r2: Array) -> ArrayPair:
     """The same of a fisheye."""
     k1, k2, k3, k4 = coefficients
     t2 = np.arctan(np.sqrt(r2)) ** 2
@@ -65,7 +65,7 @@ def angle_per_radius(r2: Array) -> Array:
     return np.arctan(r) / r
 
 
-def widest_pinhole(coefficients: tuple[float, ...]) -> float:
+def widest_pinhole(coefficients: Floats) -> float:
     """Largest tangent of the angle to the optical axis at which the distortion is valid."""
     k1, k2, _, _, k3, k4, k5, k6 = coefficients
     folds = _roots([1.0, 3 * k1, 5 * k2, 7 * k3])
@@ -79,7 +79,7 @@ def widest_pinhole(coefficients: tuple[float, ...]) -> float:
     return math.sqrt(min(folds, default=math.inf))
 
 
-def widest_fisheye(coefficients: tuple[float, ...]) -> float:
+def widest_fisheye(coefficients: Floats) -> float:
     """The same of a fisheye, at most `FISHEYE_DEG`."""
     k1, k2, k3, k4 = coefficients
     folds = _roots([1.0, 3 * k1, 5 * k2, 7 * k3, 9 * k4])

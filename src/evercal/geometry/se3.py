@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evercal.typing import Array, JsonObject
+from evercal.typing import Array, ArrayPair, JsonObject, Pair
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -279,7 +279,7 @@ def pose_to_dict(pose: SE3 | None) -> JsonObject | None:
     }
 
 
-def pose_distance(a: SE3, b: SE3) -> tuple[Array, Array]:
+def pose_distance(a: SE3, b: SE3) -> ArrayPair:
     """Metres (...) and radians (...) in [0, pi] between transforms into the same frame."""
     metres = norms(a.translation_m - b.translation_m)
     conjugate = a.rotation_wxyz * _CONJUGATE
@@ -290,7 +290,7 @@ def pose_distance(a: SE3, b: SE3) -> tuple[Array, Array]:
     return np.asarray(metres), 2.0 * np.arctan2(sine, cosine)
 
 
-def pose_distance_mm_deg(a: SE3, b: SE3) -> tuple[float, float]:
+def pose_distance_mm_deg(a: SE3, b: SE3) -> Pair:
     """`pose_distance` of two single transforms, in millimetres and degrees."""
     metres, radians = pose_distance(a, b)
     return 1000 * float(metres), float(np.rad2deg(radians))
@@ -303,7 +303,7 @@ def deviations(poses: SE3, mean: SE3) -> Array:
     return np.concatenate([shift, rotation], axis=1)
 
 
-def length_mm_deg(deviation: Array) -> tuple[float, float]:
+def length_mm_deg(deviation: Array) -> Pair:
     """Length of one deviation (6,) in millimetres and degrees."""
     metres = np.linalg.norm(deviation[:3])
     radians = np.linalg.norm(deviation[3:])

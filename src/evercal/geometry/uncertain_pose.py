@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evercal.geometry.se3 import SE3, cross_matrix
-from evercal.typing import Array
+from evercal.typing import Array, Pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class UncertainPose:
         return axis_deviation(self.covariance)[1]
 
 
-def axis_deviation(covariance: ArrayLike) -> tuple[float, float]:
+def axis_deviation(covariance: ArrayLike) -> Pair:
     """Standard deviation per axis, millimetres and degrees: root mean squares of three axes."""
     variance = np.diag(np.asarray(covariance, float))
     metres = np.sqrt(variance[:3].mean())

@@ -21,6 +21,7 @@ from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.held_out import HeldOutSplit
 from evercal.recordings.pictures import look_at
+from evercal.typing import Floats
 
 
 @frozen_arrays
@@ -34,7 +35,7 @@ class LearnedScene:
     split: HeldOutSplit
     metric: bool
     """Whether the recording was in metres."""
-    set_aside: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    set_aside: Mapping[str, Floats] = field(default_factory=dict)
     """See `LearnReport.set_aside`."""
 
     def report(self, contents: MapContents, began: float) -> LearnReport:

@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 from evercal.classes import frozen
 from evercal.mapping.built_map import Adjusted
+from evercal.typing import Floats, JsonObject, Record, Strings
 
 if TYPE_CHECKING:
     from evercal.calibration.from_map.hand_eye import HandEye
@@ -60,7 +61,7 @@ class LearnReport:
     """Frames that were learned."""
     held_out_frames: int
     """Frames that the scatter of the stated poses was fitted to."""
-    set_aside: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    set_aside: Mapping[str, Floats] = field(default_factory=dict)
     """Distances of these frames, aligned in the map, from their stated poses, millimetres (unless
     the unit is unknown) and degrees: an independent check. Empty of one that is not aligned."""
     landmarks: int = 0
@@ -73,7 +74,7 @@ class LearnReport:
     """Scenes of the map that show the same place."""
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> Strings:
         """What the map knows to be wrong about its recording."""
         from evercal.learning.stated_warnings import stated_warnings
 
@@ -85,7 +86,7 @@ class LearnReport:
                 warnings.append(other.warning)
         return tuple(warnings)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Return JSON values, as `evercal learn --json` prints them."""
         values = dict(vars(self))
         values["adjusted"] = self.adjusted and asdict(self.adjusted)
@@ -98,7 +99,7 @@ class LearnReport:
         return values
 
     @classmethod
-    def from_stored(cls, values: Mapping[str, Any]) -> Self:
+    def from_stored(cls, values: Record) -> Self:
         """The inverse of `to_dict`."""
         from evercal.calibration.calibration import Calibration
         from evercal.calibration.from_map.hand_eye import HandEye

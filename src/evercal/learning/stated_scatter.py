@@ -23,7 +23,7 @@ from evercal.localization.localizer import Localizer
 from evercal.mapping.scene_map import LeftOut, MapContents, SceneMap
 from evercal.recordings.frame import Frame
 from evercal.recordings.images import as_rgb
-from evercal.typing import Array
+from evercal.typing import Array, Floats, Pair, Strings, Triple
 
 LEAST_ANSWERS = 8
 """Least number of answers that errors are estimated from."""
@@ -52,7 +52,7 @@ def located_poses(localizer: Localizer, frames: Sequence[Frame]) -> list[SE3 | N
     return poses
 
 
-def located_as_stated(localizer: Localizer, frames: Sequence[Frame]) -> tuple[str, ...]:
+def located_as_stated(localizer: Localizer, frames: Sequence[Frame]) -> Strings:
     """Names of the posed frames that are located where their poses say."""
     [scene] = localizer.contents.scenes
     names = []
@@ -70,7 +70,7 @@ def with_scatter(
     contents: MapContents,
     held_out: Sequence[Frame],
     left_out: Sequence[LeftOut] = (),
-    noise: tuple[float, float] = (0.0, 0.0),
+    noise: Pair = (0.0, 0.0),
 ) -> SceneMap:
     """The newest scene of a map, with the scatter of its intrinsics and of its stated frame.
 
@@ -115,14 +115,14 @@ def with_scatter(
 
 def held_out_errors(
     contents: MapContents, held_out: Sequence[Frame]
-) -> dict[str, tuple[float, ...]]:
+) -> dict[str, Floats]:
     """Distances of frames, aligned in the newest scene, from their stated poses, by name.
 
     Millimetres and degrees; nothing of a frame that is not aligned.
     """
     scene = contents.scenes[-1]
     part = LeftOut(tuple(held_out), np.arange(len(scene.keyframes)))
-    errors: dict[str, tuple[float, ...]] = {frame.name: () for frame in held_out}
+    errors: dict[str, Floats] = {frame.name: () for frame in held_out}
     for frame, aligned in _aligned(contents, scene, [part], CERTAINLY_OWN):
         stated = frame.base_from_camera
         if stated is not None:
@@ -173,9 +173,7 @@ def _answer(frame: Frame, aligned: Aligned, scene: SceneMap) -> _Answer:
     return _Answer(error, estimate.covariance / np.outer(size, size))
 
 
-def intrinsics_sigma(
-    changes: Array, measured: Array, camera: Camera
-) -> tuple[float, float, float]:
+def intrinsics_sigma(changes: Array, measured: Array, camera: Camera) -> Triple:
     """Standard deviations of `SceneMap.intrinsics_sigma`, from images that measure intrinsics.
 
     Changes are (n, 5), their covariances (n, 5, 5). The variances with the greatest likelihood, by

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from evercal.geometry import Camera
 from evercal.mapping.built_map import MOST_FOCAL_PERCENT, Adjusted
 from evercal.storage.text_files import few
+from evercal.typing import JsonObject
 
 MOST_CORNER_PX = 3.0
 """Change of the corners of the image by adjusted intrinsics, pixels."""
@@ -99,7 +100,7 @@ def _intrinsics(adjusted: Adjusted) -> Iterator[str]:
         )
 
 
-def _pinhole(record: dict[str, object]) -> str:
+def _pinhole(record: JsonObject) -> str:
     camera = Camera.from_dict(record)
     numbers = (camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion)
     return " ".join(map("{:.5g}".format, numbers))

@@ -13,7 +13,7 @@ from evercal.classes import frozen, frozen_arrays
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame
 from evercal.recordings.pictures import sharpness
-from evercal.typing import Array, Image, Strings
+from evercal.typing import Array, ArrayPair, Image, Strings
 
 IMAGES = 25
 """Images of a complete recording."""
@@ -167,7 +167,7 @@ def _sample_reports(samples: Sequence[Sample], poses: SE3) -> tuple[SampleReport
     return tuple(rows)
 
 
-def _rotation_spreads_deg(poses: SE3) -> tuple[Array, Array]:
+def _rotation_spreads_deg(poses: SE3) -> ArrayPair:
     """Standard deviations about the mover's axes, and about principal axes, degrees, (3,)."""
     if len(poses) < 2:
         return np.zeros(3), np.zeros(3)

@@ -12,7 +12,7 @@ from evercal.localization.hypothesis import Aligned, Hypothesis, accepted
 from evercal.localization.lack_of_fit import WARPED, LackOfFit, lack_of_fit, unlikely
 from evercal.localization.other_bases import InBase
 from evercal.mapping.scene_map import SceneMap
-from evercal.typing import Array
+from evercal.typing import Array, Pair
 
 
 def rejection(hypothesis: Hypothesis, scene: SceneMap) -> str:
@@ -70,7 +70,7 @@ def _moved(slope: Array, covariance: Array) -> Array:
     return slope @ covariance @ slope.T
 
 
-def _diagonal(sigma: tuple[float, float]) -> Array:
+def _diagonal(sigma: Pair) -> Array:
     """(6, 6) covariance of standard deviations per axis, of translation and rotation."""
     return np.diag(np.repeat(np.square(sigma), 3))
 

@@ -14,7 +14,7 @@ import numpy as np
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.typing import Array, Image
+from evercal.typing import Array, Image, Triple
 
 Kind = Literal["own", "not stated", "same model", "stated", "unknown", "free"]
 
@@ -44,7 +44,7 @@ class IntrinsicsPrior:
     """Probability that the image is of another camera of the same model, see `SAME_MODEL`."""
     kind: Kind = "stated"
     """What is known about the camera."""
-    scatter: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scatter: Triple = (0.0, 0.0, 0.0)
     """How far intrinsics move from image to image, see `SceneMap.intrinsics_sigma`."""
 
     def variances(self, camera: Camera) -> Array:
@@ -181,7 +181,7 @@ class MovingScene(RecordedScene, Protocol):
     """A scene that states how far the intrinsics of its camera move."""
 
     @property
-    def intrinsics_sigma(self) -> tuple[float, float, float]:
+    def intrinsics_sigma(self) -> Triple:
         """From image to image, see `SceneMap.intrinsics_sigma`."""
         ...
 

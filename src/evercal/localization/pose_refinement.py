@@ -9,9 +9,9 @@ from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, UncertainPose, in_parent_axes
 from evercal.geometry.normal_equations import normal_inverse
 from evercal.localization.intrinsics import INTRINSICS
-from evercal.typing import Array
+from evercal.typing import Array, ArrayPair
 
-Pose = tuple[Array, Array]
+Pose = ArrayPair
 """Rotation (3, 3) and position (3,) of points_from_camera."""
 
 _CONVERGED = 1e-2
@@ -81,7 +81,7 @@ class Minimum:
         """Information (5,) of a prior with variances (5,), as `moved` weighs it."""
         return (self.variance + self.bent) / variances
 
-    def moved(self, prior: Array) -> tuple[Array, Array]:
+    def moved(self, prior: Array) -> ArrayPair:
         """Step (k,) to the minimum with another prior, and its covariance (k, k).
 
         The prior is the information (5,) about unchanged intrinsics, see `against`; empty where
@@ -202,7 +202,7 @@ def _stepped(change: Array, step: Array) -> Array:
     return stepped
 
 
-def whitened(white: Array, errors: Array, slope: Array) -> tuple[Array, Array]:
+def whitened(white: Array, errors: Array, slope: Array) -> ArrayPair:
     """Errors (2, n) and their derivatives (k, 2, n), whitened by (2, 2, n)."""
     residual = white[:, 0] * errors[0] + white[:, 1] * errors[1]
     by_x = white[None, :, 0] * slope[:, 0, None]
@@ -240,7 +240,7 @@ def linearise(
     position: Array,
     camera: Camera,
     intrinsics: bool = False,
-) -> tuple[Array, Array]:
+) -> ArrayPair:
     """Reprojection errors and their derivatives by the pose, and by intrinsics if wanted.
 
     Rotation and position are those of points_from_camera. Residuals are (2, n) pixels, derivatives

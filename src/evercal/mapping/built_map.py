@@ -13,7 +13,7 @@ from evercal.mapping.bundle_equations import DISTORTION, INTRINSICS, Adjustment
 from evercal.mapping.scene_map import LeftOut, SceneMap
 from evercal.recordings.frame import Frame
 from evercal.robot.arm_offsets import ArmOffsets
-from evercal.typing import Array, IntArray, Strings
+from evercal.typing import Array, Floats, IntArray, JsonObject, Pair, Strings
 
 GAP = 10
 """Cross-validation: frames without keyframes before and after a part that is left out. Frames
@@ -38,10 +38,10 @@ PART = 4
 class Adjusted:
     """What bundle adjustment changed about a recording, as JSON values."""
 
-    common_translation_mm: tuple[float, ...] | None = (0.0, 0.0, 0.0)
+    common_translation_mm: Floats | None = (0.0, 0.0, 0.0)
     """(3,) correction common to all stated poses, in the camera frame; None where their unit of
     length is unknown, as `pose_sigma_mm`."""
-    common_rotation_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
+    common_rotation_deg: Floats = (0.0, 0.0, 0.0)
     """(3,) its rotation vector."""
     common_sigma_mm: float | None = 0.0
     """Standard deviation of the length of that translation, with systematic errors; None as it."""
@@ -69,7 +69,7 @@ class Adjusted:
     """Frames whose stated pose has an unusually large error; they were given less weight."""
     corner_px: float = 0.0
     """Largest change of a corner of the first frame's image by the intrinsics, pixels."""
-    intrinsics: tuple[dict[str, object], ...] = ()
+    intrinsics: tuple[JsonObject, ...] = ()
     """Its intrinsics as stated and as adjusted; none without adjustment."""
 
     @classmethod
@@ -183,7 +183,7 @@ class BuiltMap:
     """Adjustment of `gripper_from_camera`; None where camera poses were stated."""
 
     @property
-    def independent_noise(self) -> tuple[float, float]:
+    def independent_noise(self) -> Pair:
         """Standard deviation of stated poses per axis that neighbouring frames do not share."""
         metres = (self.adjusted.pose_sigma_mm or 0) / 1000
         radians = np.deg2rad(self.adjusted.pose_sigma_deg)

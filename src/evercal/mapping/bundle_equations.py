@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, cross_matrix
-from evercal.typing import Array, BoolArray, IntArray
+from evercal.typing import Array, ArrayPair, BoolArray, IntArray
 
 COMMON = 6
 """Shared parameters of the common transform."""
@@ -173,9 +173,7 @@ class StatedFrames:
             part[~valid] = 0
         return Linearised(*parts, valid)
 
-    def _rays(
-        self, tracks: BundleTracks, parameters: Parameters
-    ) -> tuple[Array, Array]:
+    def _rays(self, tracks: BundleTracks, parameters: Parameters) -> ArrayPair:
         """Rays (m, 3) of the observed landmarks in their hosts, and derivatives (m, 2, 8)."""
         ray = np.zeros((len(tracks.host), 3))
         slope = np.zeros((len(tracks.host), 2, INTRINSICS))
@@ -186,7 +184,7 @@ class StatedFrames:
             slope[rows] = -np.linalg.solve(by_plane, by_camera)
         return ray[tracks.landmark], slope[tracks.landmark]
 
-    def _corrected(self, parameters: Parameters) -> tuple[Array, Array]:
+    def _corrected(self, parameters: Parameters) -> ArrayPair:
         """Rotations (n, 3, 3) and positions (n, 3) of the corrected poses."""
         translation, turn = np.split(parameters.correction, 2, axis=1)
         rotation = self._rotation @ Rotation.from_rotvec(turn).as_matrix()

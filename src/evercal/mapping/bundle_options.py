@@ -9,7 +9,7 @@ from evercal.errors import require_numbers
 from evercal.geometry import Camera
 from evercal.geometry.distortion import USUAL_DISTORTION
 from evercal.mapping.bundle_equations import INTRINSICS
-from evercal.typing import Array
+from evercal.typing import Array, Pair
 
 FIXED = 1e-9
 """Prior standard deviation of shared parameters that are not adjusted."""
@@ -59,7 +59,7 @@ class BundleOptions:
     """Prior standard deviation of the principal point, pixels."""
     distortion_sigma: float = 0.2
     """Prior standard deviation of k1 and k2 where the recording states no distortion."""
-    lens_sigma: tuple[float, float] | None = None
+    lens_sigma: Pair | None = None
     """Prior standard deviations of an uncertain lens, which stay whatever the images say: of the
     focal length and of the principal point, as shares of the focal length. The distortion is then
     that of an unknown lens. None: intrinsics change only where the images require it."""

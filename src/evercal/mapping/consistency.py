@@ -1,6 +1,6 @@
 """Whether a stored scene is one: right checksums say only that a file is what somebody wrote."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import size_in_header
+from evercal.typing import Record
 
 _MOST = 1e6
 """Pixels, metres, or whatever a unit is."""
@@ -87,7 +88,7 @@ def require_of_encoder(scene: SceneMap, encoder: Encoder, short_side: int) -> No
         _require_small(f"keyframe {i}: depths", depths)
 
 
-def require_landmarks(arrays: Mapping[str, Any], cameras: Sequence[Camera]) -> None:
+def require_landmarks(arrays: Record, cameras: Sequence[Camera]) -> None:
     """Raise ValueError for stored landmarks outside their images, or without depth.
 
     `arrays` are those of `Keyframes.to_tensors`.

@@ -5,7 +5,7 @@ its 1,200 features of 128 half floats 307 kB. The frozen encoder computes the sa
 image in milliseconds. A map adds depths, landmarks and a descriptor to each.
 """
 
-from collections.abc import Callable, Mapping, Sequence, Sized
+from collections.abc import Callable, Sequence, Sized
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -19,7 +19,7 @@ from evercal.geometry import SE3, Camera
 from evercal.mapping.landmarks import Landmarks
 from evercal.recordings.frame import Frame
 from evercal.recordings.images import encode_jpeg
-from evercal.typing import IntArray
+from evercal.typing import IntArray, Record
 
 JPEG_QUALITY = 95
 """Quality of stored images, percent."""
@@ -159,7 +159,7 @@ class Keyframes:
         return tensors
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, Any]) -> "Keyframes":
+    def from_tensors(cls, tensors: Record) -> "Keyframes":
         """The inverse of `to_tensors`.
 
         Arrays of `storage.tensors.open_tensors` stay in their file: images, depths and landmarks

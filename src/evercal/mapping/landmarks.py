@@ -7,7 +7,7 @@ import numpy as np
 
 from evercal.classes import frozen_arrays
 from evercal.geometry import Camera, spread
-from evercal.typing import Array, Image, IntArray
+from evercal.typing import Array, Image, IntArray, Size
 
 MIN_TEXTURE = 1e-4
 """Smallest minimum eigenvalue (cv2.cornerMinEigenVal, 5x5) of a landmark's pixel."""
@@ -107,7 +107,7 @@ def project_surface(
 
 def detect(
     grey: Image,
-    grid: tuple[int, int],
+    grid: Size,
     cell_px: float,
 ) -> tuple[Array, IntArray]:
     """Detect the most textured pixel of every textured cell.
@@ -136,7 +136,7 @@ def detect(
 
 def slopes(
     inverse_depth: Array,
-    grid: tuple[int, int],
+    grid: Size,
     cell_px: float,
 ) -> Array:
     """(cells, 2) change of inverse depth per pixel, from the inverse depths (cells,) of a grid.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, UncertainPose, norms, pose_to_dict
-from evercal.typing import Array
+from evercal.typing import Array, JsonObject, Pair, Record
 
 RADII = ((0.1, 10.0), (0.2, 15.0), (0.4, 25.0))
 """Candidate correlation lengths of corrections, metres and degrees."""
@@ -42,7 +42,7 @@ class FrameCorrection:
     """(n,) base_from_camera as adjusted, without the common transform."""
     correction: Array
     """(n, 6) in the camera frame, metres and radians."""
-    radius: tuple[float, float]
+    radius: Pair
     """Correlation length, metres and radians."""
 
     def at(self, pose: SE3) -> Array:
@@ -85,9 +85,9 @@ class MapFrame:
     """stated_camera_from_camera: adjusted poses are stated poses times this."""
     correction: FrameCorrection | None = None
     """Slowly varying corrections; None if neighbours do not predict them."""
-    pose_sigma: tuple[float, float] = (0.0, 0.0)
+    pose_sigma: Pair = (0.0, 0.0)
     """Standard deviation of the adjusted poses per axis, metres and radians."""
-    frame_sigma: tuple[float, float] = (0.0, 0.0)
+    frame_sigma: Pair = (0.0, 0.0)
     """Standard deviation of the stated frame about the map per axis, metres and radians: errors of
     the stated poses that neighbouring frames share, see `shared_sigma`."""
     similarity: Similarity | None = None
@@ -205,7 +205,7 @@ def shared_sigma(
     poses: SE3,
     correction: Array,
     fitted: FrameCorrection | None,
-) -> tuple[float, float]:
+) -> Pair:
     """Standard deviation per axis of stated poses whose errors neighbouring frames share.
 
     Poses and corrections (n, 6) are those of `fit_correction`, in recorded order; `fitted` is its
@@ -234,7 +234,7 @@ def _shared(correction: Array, left: Array) -> float:
 def _left_out(
     poses: SE3,
     correction: Array,
-    radius: tuple[float, float],
+    radius: Pair,
 ) -> Array:
     """(n, 6) corrections that the other frames predict."""
     rows = [_closeness(poses, pose, radius) for pose in poses]
@@ -246,7 +246,7 @@ def _left_out(
 def _closeness(
     poses: SE3,
     pose: SE3,
-    radius: tuple[float, float],
+    radius: Pair,
 ) -> Array:
     """(n,) Gaussian weights of poses by their distance to one pose."""
     metres = norms(poses.translation_m - pose.translation_m)
@@ -257,7 +257,7 @@ def _closeness(
     return np.exp(-0.5 * far**2 - 0.5 * turned**2)
 
 
-def frame_to_dict(frame: MapFrame) -> dict[str, object]:
+def frame_to_dict(frame: MapFrame) -> JsonObject:
     """A map's frame as JSON values, without its slowly varying corrections."""
     base = None
     similarity = frame.similarity
@@ -275,9 +275,7 @@ def frame_to_dict(frame: MapFrame) -> dict[str, object]:
     }
 
 
-def frame_of(
-    content: Mapping[str, Any], correction: FrameCorrection | None
-) -> MapFrame:
+def frame_of(content: Record, correction: FrameCorrection | None) -> MapFrame:
     """The inverse of `frame_to_dict`."""
     base = content["base_from_map"]
     covariance = content["base_covariance"]
@@ -297,7 +295,7 @@ def frame_of(
     )
 
 
-def _pair(values: Sequence[float]) -> tuple[float, float]:
+def _pair(values: Sequence[float]) -> Pair:
     return float(values[0]), float(values[1])
 
 

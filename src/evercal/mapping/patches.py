@@ -13,7 +13,7 @@ import numpy as np
 
 from evercal.geometry import resize_pixels
 from evercal.geometry.normal_equations import gram
-from evercal.typing import Array, Image, IntArray
+from evercal.typing import Array, ArrayPair, Image, IntArray
 
 RADIUS = 5
 """Pixels of a patch beside its centre, along each axis."""
@@ -119,7 +119,7 @@ def align_patches(
     centres: Array,
     affines: Array,
     iterations: int,
-) -> tuple[Array, Array]:
+) -> ArrayPair:
     """Align patches in another image.
 
     The affines (n, 2, 2) lead from keyframe pixels to pixels of the other image around the centres
@@ -174,7 +174,7 @@ def align_down(
     start: Array,
     affines: Array,
     steps: Sequence[tuple[int, int]],
-) -> tuple[Array, Array]:
+) -> ArrayPair:
     """`align_patches` from coarse to fine.
 
     `start` and the result are (n, 2) pixels of level 0, each step is (level, iterations). Returns

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from evercal.classes import frozen_arrays
 from evercal.features.views import ideal_cell_pixels
 from evercal.geometry import SE3, Camera
-from evercal.typing import Array, BoolArray, Float32Array
+from evercal.typing import Array, ArrayPair, BoolArray, Float32Array, Size
 
 NEAR_M = 0.25
 """Smallest depth in a room, metres; other recordings scale it (`pose_check.depth_scale`)."""
@@ -51,7 +51,7 @@ class PosedCells:
     """Pixels per cell."""
 
     @property
-    def grid(self) -> tuple[int, int]:
+    def grid(self) -> Size:
         """Rows and columns of cells."""
         return self.camera.height // self.stride, self.camera.width // self.stride
 
@@ -190,7 +190,7 @@ class _SourceView:
             sampled[block] = cv2.remap(image, right[block], below, cv2.INTER_LINEAR)
         return np.maximum(sampled, 0) * inside
 
-    def normal_equation(self, inverse: Array) -> tuple[Array, Array]:
+    def normal_equation(self, inverse: Array) -> ArrayPair:
         """Gradient and Hessian (cells,) of least squares in the inverse depth of each cell."""
         rho = inverse.astype(float)
         u, v, front = self.pixels(rho)
@@ -216,7 +216,7 @@ def peak(
     similarity: Array,
     row: NDArray[np.integer],
     column: NDArray[np.integer],
-) -> tuple[Array, Array]:
+) -> ArrayPair:
     """The most similar cell of the 3x3 around a cell, to a fraction of a cell.
 
     The similarity (n, h, w) is that of n cells to all cells of another view; rows and columns (n,)

@@ -14,7 +14,7 @@ from evercal.geometry import SE3, Camera, pose_distance
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import MapFrame
 from evercal.robot.frame_names import UNKNOWN, FrameNames
-from evercal.typing import IntArray
+from evercal.typing import IntArray, Triple
 
 if TYPE_CHECKING:
     from evercal.recordings.frame import Frame
@@ -36,7 +36,7 @@ class SceneMap:
     """Relation of the landmarks' frame to the base frame."""
     train_frames: int
     """Frames that the map was built from."""
-    intrinsics_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    intrinsics_sigma: Triple = (0.0, 0.0, 0.0)
     """Standard deviation of its intrinsics from image to image: focal length as a share, principal
     point as a share of the longer side, k1 and k2. A stabilised camera moves its image."""
     parent_frame: str = "base"

@@ -211,7 +211,7 @@ class MapStore(StageStore[MapContents]):
         self.contents = self.contents.with_replaced(index, scene)
 
     @property
-    def payload(self) -> dict[str, object]:
+    def payload(self) -> JsonObject:
         """Settings in the manifest."""
         return {
             "kind": KIND,

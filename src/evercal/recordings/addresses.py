@@ -12,6 +12,7 @@ from evercal.bounds import bounds, require_at_most
 from evercal.classes import frozen
 from evercal.errors import InputError, optional_module, without_secrets
 from evercal.storage.text_files import library_errors
+from evercal.typing import Strings
 
 Check = Callable[[Path], object]
 _TEXTS = (".csv", ".json", ".txt", ".urdf", ".yaml", ".yml")
@@ -81,7 +82,7 @@ def _is_text(file: str, size: int) -> bool:
     return file.endswith(_TEXTS) and size <= bounds().text_bytes
 
 
-def stamps(address: str) -> list[tuple[str, ...]]:
+def stamps(address: str) -> list[Strings]:
     """Name and version of every file at an address; a file that changes gets another version.
 
     fsspec's own `ukey` is that of the address over HTTP, and another one in each process for zip.

@@ -14,7 +14,7 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.images import Picture, file_of, files_in, is_readable, pixels_of
 from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.storage.text_files import few
-from evercal.typing import Image, Strings
+from evercal.typing import Floats, Image, Strings
 
 if TYPE_CHECKING:
     from evercal.robot.arm import Arm
@@ -40,7 +40,7 @@ class Frame:
     """Gripper pose in the robot's base frame at the time of the image, if there is an arm."""
     depth: Path | None = None
     """16-bit PNG of the image's size: millimetres along the optical axis, 0 where unknown."""
-    joints_rad: tuple[float, ...] | None = None
+    joints_rad: Floats | None = None
     """Joint values of the arm at the time of the image, if stated: radians, or metres of sliding
     joints."""
 

@@ -18,7 +18,7 @@ from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.storage.atomic import naming_file, write_bytes
 from evercal.storage.text_files import named_errors, natural_key
-from evercal.typing import Image, PathLike, Strings
+from evercal.typing import Image, PathLike, Size, Strings
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 """Endings of image files, in lower case."""
@@ -148,7 +148,7 @@ def _is_whole_png(data: Image) -> bool:
     return kind == b"IEND"
 
 
-def first_size(paths: Sequence[Path]) -> tuple[int, int]:
+def first_size(paths: Sequence[Path]) -> Size:
     """Width and height of the first image that can be read, turned upright as by `read_image`."""
     return image_size(next(filter(is_readable, paths), paths[0]))
 
@@ -239,7 +239,7 @@ def decode_image(data: Image, turned: bool = True, name: str = "image") -> Image
     return as_rgb(image)
 
 
-def size_in_header(data: Image) -> tuple[int, int]:
+def size_in_header(data: Image) -> Size:
     """Width and height by the header of an image file, (n,) uint8 bytes; not turned.
 
     Raises:
@@ -300,7 +300,7 @@ def encode_jpeg(image: Image, quality: int) -> bytes:
     return cv2.imencode(".jpg", image, parameters)[1].tobytes()
 
 
-def image_size(image: PathLike | StoredImage) -> tuple[int, int]:
+def image_size(image: PathLike | StoredImage) -> Size:
     """Width and height in pixels of an image file, turned upright as by `read_image`."""
     if not isinstance(image, StoredImage):
         image = Path(image)

@@ -20,7 +20,7 @@ from evercal.recordings.frame import (
 from evercal.recordings.images import file_of
 from evercal.recordings.pictures import look_at
 from evercal.recordings.poses.pose_evidence import rotation_warnings
-from evercal.typing import Strings
+from evercal.typing import Strings, Triple
 
 SAME_M = 0.001
 """Distance below which two poses are the same, metres."""
@@ -59,7 +59,7 @@ class Inspection:
     """One line for each set of intrinsics."""
     metric: bool
     """Whether lengths are in metres; else their unit is unknown."""
-    extent_m: tuple[float, float, float]
+    extent_m: Triple
     """Sides of the box around the training positions, metres."""
     step_median_m: float | None = None
     """Median distance between consecutive training frames, metres; None for fewer than two."""

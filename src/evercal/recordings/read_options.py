@@ -5,6 +5,7 @@ from pathlib import Path
 
 from evercal.choices import ConventionName
 from evercal.errors import InputError
+from evercal.typing import Strings
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,6 @@ class ReadOptions:
         if self.whole_robot and self.gripper_frame:
             raise InputError("`gripper_frame`: all joints are read; leave it out")
 
-    def given(self) -> tuple[str, ...]:
+    def given(self) -> Strings:
         """Names of the fields that differ from their defaults."""
         return tuple(f.name for f in fields(self) if getattr(self, f.name) != f.default)

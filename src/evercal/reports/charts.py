@@ -7,7 +7,7 @@ import numpy as np
 
 from evercal.classes import frozen_arrays
 from evercal.reports.overlay import overlay_lines
-from evercal.typing import Array, Image
+from evercal.typing import Array, Image, Size
 
 Text = tuple[str, float, float, int]
 """Words, and the pixel on their base line that they lie right of (0), around (1) or left of (2)."""
@@ -56,7 +56,7 @@ class Shape(NamedTuple):
 class Panel:
     """Shapes in a box with axes at the left and bottom; nothing is drawn outside."""
 
-    size: tuple[int, int]
+    size: Size
     """Width and height of the box, pixels."""
     limits: Array
     """(2, 2) lower and upper ends of both axes, in their units."""

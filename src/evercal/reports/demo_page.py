@@ -8,6 +8,7 @@ from statistics import median
 from evercal.classes import frozen
 from evercal.evaluation import FrameResult, scores
 from evercal.reports.page import Picture, Table, Tile, render
+from evercal.typing import JsonObject
 
 
 @frozen
@@ -81,7 +82,7 @@ class DemoResult:
             refused: "images of unknown rooms refused",
         }
 
-    def to_dict(self) -> dict[str, object]:
+    def to_dict(self) -> JsonObject:
         """JSON values."""
         return {
             "rooms": [room.room for room in self.learned],

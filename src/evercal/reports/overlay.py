@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from evercal.geometry import SE3, Camera, norms, resize_pixels
-from evercal.typing import Array, Image
+from evercal.typing import Array, Image, Pair
 
 if TYPE_CHECKING:
     from evercal.localization.estimate import PoseEstimate
@@ -187,7 +187,7 @@ def exaggeration(vectors: Array) -> int:
     return 1
 
 
-def colour_map(values: Array, limits: tuple[float, float]) -> Image:
+def colour_map(values: Array, limits: Pair) -> Image:
     """Map values (n,) to (n, 3) RGB with viridis; NaN is grey."""
     import cv2
 
@@ -217,7 +217,7 @@ def resized(image: Image, width: int) -> Image:
     return np.asarray(other, np.uint8)
 
 
-def _draw_legend(image: Image, text: str, limits: tuple[float, float]) -> None:
+def _draw_legend(image: Image, text: str, limits: Pair) -> None:
     import cv2
 
     low, high = limits

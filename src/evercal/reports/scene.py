@@ -17,7 +17,7 @@ from evercal.mapping.landmarks import Landmarks
 from evercal.mapping.scene_map import SceneMap
 from evercal.reports.charts import Panel, Shape
 from evercal.reports.overlay import colour_map
-from evercal.typing import Array, Image
+from evercal.typing import Array, Image, Size
 
 ColourBy = Literal["image", "height", "uncertainty"]
 Plane = tuple[int, int]
@@ -303,7 +303,7 @@ class Axes(NamedTuple):
 
 
 def view_panel(
-    size: tuple[int, int],
+    size: Size,
     axes: Axes,
     around: Surroundings,
     shown: Array,

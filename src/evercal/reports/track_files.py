@@ -9,6 +9,7 @@ from evercal.geometry import pose_to_dict
 from evercal.localization.tracking import TrackedFrame
 from evercal.reports.answers import Answer, answer_row
 from evercal.storage.atomic import naming_file
+from evercal.typing import JsonObject
 
 ENDINGS = (".jsonl", ".tum", ".txt")
 """Endings of the names of files of poses."""
@@ -17,9 +18,7 @@ _TUM_HEADER = (
 )
 
 
-def track_row(
-    frame: TrackedFrame, name: str, unit_known: bool = True
-) -> dict[str, object]:
+def track_row(frame: TrackedFrame, name: str, unit_known: bool = True) -> JsonObject:
     """Return a frame as JSON values: the row of `evercal localize --json`, state and time."""
     answer = Answer(Path(name), frame.estimate, frame.estimate.milliseconds, unit_known)
     return {
@@ -51,7 +50,7 @@ class TrackFile(AbstractContextManager["TrackFile"]):
         if self._tum:
             self._file.write(_TUM_HEADER)
 
-    def write(self, frame: TrackedFrame, row: dict[str, object]) -> None:
+    def write(self, frame: TrackedFrame, row: JsonObject) -> None:
         """Append a frame; `row` is that of `track_row`."""
         line = json.dumps(row) + "\n"
         if self._tum:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from evercal.classes import frozen_arrays
 from evercal.geometry import SE3
-from evercal.typing import Array, BoolArray, Strings
+from evercal.typing import Array, BoolArray, Pair, Strings
 
 
 class MovingJoint(NamedTuple):
@@ -41,7 +41,7 @@ class Arm:
     ranges: Array = field(default_factory=lambda: np.pi * np.arange(-1, 2))
     """(k, 3) lower limit, usual value and upper limit of each value; or (3,) of all."""
     name: str = "the arm"
-    assumed: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+    assumed: tuple[Pair, ...] = ((0.0, 0.0),)
     """Heights of the stated base above its own, and lengths of a tool along the axis of its
     gripper, that may be meant by stated poses; metres."""
 

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from evercal.geometry import SE3, Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.recordings.images import as_rgb
 from evercal.robot.mount import MountName
-from evercal.typing import PathLike, Strings
+from evercal.typing import PathLike, Record, Strings
 
 if TYPE_CHECKING:
     from evercal.calibration.drift import Shift
@@ -184,7 +184,7 @@ def _poses_part(poses: PathLike | SE3) -> Part:
     return "poses.csv", "\n".join(lines).encode()
 
 
-def _estimate(row: Mapping[str, Any]) -> PoseEstimate:
+def _estimate(row: Record) -> PoseEstimate:
     pose = row["base_from_camera"]
     covariance = row["covariance"]
     return PoseEstimate(
@@ -204,5 +204,5 @@ def _estimate(row: Mapping[str, Any]) -> PoseEstimate:
     )
 
 
-def _pose(values: Mapping[str, Any]) -> SE3:
+def _pose(values: Record) -> SE3:
     return SE3(values["quaternion_wxyz"], values["translation_m"])

@@ -20,6 +20,7 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.images import decode_image, size_in_header
 from evercal.recordings.poses.pairing import poses_of_images
+from evercal.typing import Size
 
 Content = TypeVar("Content")
 
@@ -73,7 +74,7 @@ class Sent(Sequence[tuple[str, np.ndarray]]):
         return name, decoded(data, name, self._limits)
 
 
-def _header_size(data: bytes, name: str) -> tuple[int, int]:
+def _header_size(data: bytes, name: str) -> Size:
     try:
         return size_in_header(np.frombuffer(data, np.uint8))
     except ValueError:
@@ -87,7 +88,7 @@ def _unreadable(data: bytes, name: str) -> InputError:
 
 
 @lru_cache(maxsize=8)  # a robot sends the same intrinsics with every image
-def camera_of(data: bytes | None, size: tuple[int, int]) -> Camera | None:
+def camera_of(data: bytes | None, size: Size) -> Camera | None:
     """Intrinsics in a file of any format, for images of a size (width, height)."""
     if data is None:
         return None

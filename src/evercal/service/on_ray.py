@@ -16,6 +16,7 @@ from evercal.processes import cores
 from evercal.service.client import Client
 from evercal.service.hosts import url_of
 from evercal.service.server import DRAIN_S, ServeOptions, make_app, require_token
+from evercal.typing import Strings
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -53,7 +54,7 @@ def serve_on_ray(
     options: ServeOptions,
     address: str,
     replicas: int,
-    on_ready: Callable[[str, tuple[str, ...]], object],
+    on_ready: Callable[[str, Strings], object],
 ) -> None:
     """Serve a map on a cluster until SIGTERM or SIGINT; see `server.serve`.
 

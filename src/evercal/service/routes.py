@@ -52,7 +52,7 @@ from evercal.service.schemas import (
     Upload,
 )
 from evercal.service.stream import Frame, Stream
-from evercal.typing import Strings
+from evercal.typing import JsonObject, Strings
 
 router = APIRouter(
     generate_unique_id_function=lambda route: route.name,
@@ -176,7 +176,7 @@ async def localize(
     data = await image.read()
     intrinsics = await _content(camera)
 
-    def work(_: Check) -> dict[str, Any]:
+    def work(_: Check) -> JsonObject:
         localizer = service.live.within(scene)
         began = time.perf_counter()
         pixels = decoded(data, name, service.limits)
@@ -241,7 +241,7 @@ async def calibrate(
 ) -> Response:
     """Calibrate a camera from its images: the calibration file."""
 
-    def work(check: Check) -> dict[str, Any]:
+    def work(check: Check) -> JsonObject:
         given = decode(check)
         scenes = service.live.within(scene)
         return from_images.calibrate(scenes, given, mount).to_dict()
@@ -267,7 +267,7 @@ async def check(
     """Test whether a fixed camera has moved: the object of `evercal check --json`."""
     content = await calibration.read()
 
-    def work(check: Check) -> dict[str, Any]:
+    def work(check: Check) -> JsonObject:
         reference = calibration_of(content)
         given = decode(check)
         shift = drift.check(
@@ -282,7 +282,7 @@ async def check(
     return _json(await service.desk.run(work, request))
 
 
-def _json(content: dict[str, Any], status: int = 200) -> Response:
+def _json(content: JsonObject, status: int = 200) -> Response:
     # Faster than JSONResponse; null for what is not finite.
     text = to_json(content, inf_nan_mode="null")
     return Response(text, status, media_type="application/json")
@@ -329,7 +329,7 @@ async def track(
     tracker: Tracker | None = None
     tracked: tuple[Localizer, bytes] | None = None
 
-    def locate(frame: Frame, name: str) -> dict[str, Any]:
+    def locate(frame: Frame, name: str) -> JsonObject:
         nonlocal tracker, tracked
         localizer = service.live.localizer
         image = decoded(frame.data, name, service.limits)
@@ -342,7 +342,7 @@ async def track(
         known = unit_known(localizer, located.estimate.scene)
         return track_row(located, name, known)
 
-    async def row(frame: Frame) -> dict[str, Any]:
+    async def row(frame: Frame) -> JsonObject:
         name = f"frame {frame.number}"
         try:
             return await service.desk.run(lambda _: locate(frame, name))

@@ -16,6 +16,7 @@ from evercal.choices import MountName, Status
 from evercal.geometry import Camera
 from evercal.robot.frame_names import FrameNames
 from evercal.storage.provenance import Made
+from evercal.typing import JsonObject
 
 DESCRIPTION = """
 evercal answers where a camera is: one image in, the camera's pose in the robot base frame out.
@@ -63,7 +64,7 @@ class Upload(UploadFile):
         return super()._validate(value, _)
 
     @classmethod
-    def __get_pydantic_json_schema__(cls, *_: Any) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(cls, *_: Any) -> JsonObject:
         return FILE
 
 
@@ -207,11 +208,11 @@ class CalibrationFile(Transform):
     joint_covariance: Matrix
     verdict: str
     """Uses that it serves, one or two sentences."""
-    source: dict[str, Any]
+    source: JsonObject
     """Map, scene and options."""
     created: str
     """ISO 8601."""
-    verifications: list[dict[str, Any]]
+    verifications: list[JsonObject]
     made: Made | None
     """Version, command and inputs."""
 

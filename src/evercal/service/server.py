@@ -27,6 +27,7 @@ from evercal.service.desk import Desk
 from evercal.service.guard import PAGES, Guard, Metrics
 from evercal.service.live_map import LiveMap
 from evercal.service.schemas import DESCRIPTION, TAGS
+from evercal.typing import Strings
 
 POLL_S = 0.5
 """Interval of the search for changes that other processes make to the map."""
@@ -58,7 +59,7 @@ class ServeOptions:
 
 def make_app(
     options: ServeOptions,
-    on_ready: Callable[[tuple[str, ...]], object] = lambda _: None,
+    on_ready: Callable[[Strings], object] = lambda _: None,
 ) -> FastAPI:
     """The application; `on_ready` gets the names of the scenes when requests are answered."""
     live = LiveMap(options.map, options.known)
@@ -208,9 +209,7 @@ def server_of(app: FastAPI, limits: RequestBounds) -> uvicorn.Server:
     )
 
 
-def serve(
-    options: ServeOptions, on_ready: Callable[[str, tuple[str, ...]], object]
-) -> None:
+def serve(options: ServeOptions, on_ready: Callable[[str, Strings], object]) -> None:
     """Serve a map until SIGTERM or SIGINT; requests under way are answered before.
 
     `on_ready` gets the address and the names of the scenes.

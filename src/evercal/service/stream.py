@@ -4,9 +4,11 @@ import asyncio
 import json
 from collections import deque
 from collections.abc import Awaitable, Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from evercal.typing import JsonObject
 
 _FULL_S = 0.02
 """Time between looks whether a full stream has become shorter, seconds."""
@@ -50,7 +52,7 @@ class Stream:
         self._dropped = 0
         self._arrived = asyncio.Event()
 
-    async def answer(self, row: Callable[[Frame], Awaitable[dict[str, Any]]]) -> None:
+    async def answer(self, row: Callable[[Frame], Awaitable[JsonObject]]) -> None:
         """Answer every frame with a row until the client leaves."""
         await self._socket.accept()
         reading = asyncio.create_task(self._read())

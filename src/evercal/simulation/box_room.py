@@ -21,7 +21,7 @@ from evercal.simulation.surfaces import (
     unit_vector,
 )
 from evercal.simulation.textures import dead_leaves, one_over_f
-from evercal.typing import Array, Image
+from evercal.typing import Array, ArrayPair, Image
 
 _SMALLEST_PX = 16
 """Side of the smallest image of a texture pyramid, pixels."""
@@ -151,7 +151,7 @@ class BoxRoom:
         self,
         origin_m: Array,
         rays: Array,
-    ) -> tuple[Array, Array]:
+    ) -> ArrayPair:
         """First intersections (n, 3) of rays, and their depths (n,) in units of the ray length.
 
         Origins (3,) or (n, 3) and directions (n, 3) of any length are in the base frame. Rays that

@@ -9,7 +9,7 @@ from numpy.random import default_rng
 from evercal.classes import frozen_arrays
 from evercal.geometry import SE3
 from evercal.simulation.panda_arm import HOME_RAD, base_from_flange, joints_for
-from evercal.typing import Array
+from evercal.typing import Array, Floats
 
 SPEED_RAD_S = 1.0
 """Speed of the fastest joint, radians per second."""
@@ -97,7 +97,7 @@ class VirtualRobot:
         """The stated pose of the flange."""
         return base_from_flange(self._stated_joints())
 
-    def joints_rad(self) -> tuple[float, ...]:
+    def joints_rad(self) -> Floats:
         """The seven stated joint angles, radians."""
         return tuple(self._stated_joints().tolist())
 

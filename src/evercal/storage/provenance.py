@@ -21,7 +21,7 @@ from evercal.classes import frozen
 from evercal.errors import without_secrets
 from evercal.processes import command_line
 from evercal.storage.manifest import MANIFEST, sha256_file
-from evercal.typing import JsonObject, Strings
+from evercal.typing import JsonObject, Record, Strings
 
 _PATHS = ("images", "recording", "recordings", "robot_poses")
 """Arguments whose text may be a path."""
@@ -46,7 +46,7 @@ class Made:
     """ISO 8601 time with zone."""
 
     @classmethod
-    def of(cls, command: Strings, arguments: Mapping[str, Any]) -> Self:
+    def of(cls, command: Strings, arguments: Record) -> Self:
         """The record of a command that is given arguments; inputs are read now."""
         inputs = {}
         for name, value in arguments.items():
@@ -59,7 +59,7 @@ class Made:
         )
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any] | None) -> Self | None:
+    def from_dict(cls, data: Record | None) -> Self | None:
         """The inverse of `asdict`; None of files without a record."""
         if not data:
             return None
@@ -88,7 +88,7 @@ _CALL: ContextVar[Callable[[], Made | None]] = ContextVar("call")
 
 
 @contextmanager
-def call(command: Strings, arguments: Mapping[str, Any]) -> Iterator[None]:
+def call(command: Strings, arguments: Record) -> Iterator[None]:
     """What is made in this block was made by a command; an outer call keeps its own."""
     made = _CALL.get(cache(partial(Made.of, command, arguments)))
     token = _CALL.set(made)

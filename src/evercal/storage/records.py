@@ -1,12 +1,12 @@
 """JSON files that evercal wrote: they state their format and version."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from evercal.errors import InputError
-from evercal.typing import PathLike
+from evercal.typing import PathLike, Record
 
 Content = TypeVar("Content")
 
@@ -15,7 +15,7 @@ def of_format(
     data: object,
     format: str,
     version: int,
-    read: Callable[[Mapping[str, Any]], Content],
+    read: Callable[[Record], Content],
 ) -> Content:
     """Convert JSON values that state their format and version.
 

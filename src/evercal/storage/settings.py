@@ -6,6 +6,7 @@ from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.storage.atomic import write_json
+from evercal.typing import JsonObject
 
 
 def lock_settings(path: Path, settings: Mapping[str, object]) -> None:
@@ -28,7 +29,7 @@ def lock_settings(path: Path, settings: Mapping[str, object]) -> None:
             )
 
 
-def read_settings(path: Path) -> dict[str, object]:
+def read_settings(path: Path) -> JsonObject:
     """Read the settings that `lock_settings` stored."""
     try:
         settings = json.loads(path.read_text(encoding="utf-8"))

@@ -10,6 +10,7 @@ from typing import Any
 
 from evercal.bounds import bounds, require_at_most
 from evercal.errors import InputError
+from evercal.typing import JsonObject
 
 _CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f\x7f-\x9f]")
 _OF_OPENCV = re.compile(r"^%.*$|!!opencv-[a-z-]+", re.MULTILINE)
@@ -99,7 +100,7 @@ def _unicode_of(data: bytes) -> str:
     return "utf-8-sig"
 
 
-def read_json(path: Path, what: str, remedy: str = "check the path") -> dict[str, Any]:
+def read_json(path: Path, what: str, remedy: str = "check the path") -> JsonObject:
     """Read a JSON object; `what` names its contents in messages."""
     try:
         data = json.loads(read_text(path, what, remedy))

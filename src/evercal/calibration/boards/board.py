@@ -16,6 +16,7 @@ from typing import Any, Self, get_args
 from evercal.choices import BoardKind
 from evercal.classes import frozen
 from evercal.errors import InputError
+from evercal.typing import JsonObject
 
 _LEAST_COUNT = {
     "chessboard": 3,
@@ -108,7 +109,7 @@ class Board:
         """Whether the corners look the same after a rotation by 90 degrees."""
         return self.kind == "chessboard" and self.columns == self.rows
 
-    def to_dict(self) -> dict[str, object]:
+    def to_dict(self) -> JsonObject:
         """Return JSON values."""
         return dict(vars(self))
 

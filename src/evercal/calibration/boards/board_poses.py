@@ -14,7 +14,7 @@ neighbours.
 
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.storage import write_json
 from evercal.storage.records import of_format, read_record
-from evercal.typing import Array, JsonObject, PathLike
+from evercal.typing import Array, JsonObject, Pair, PathLike, Record
 
 FORMAT = "evercal-board-poses"
 VERSION = 1
@@ -50,7 +50,7 @@ class BoardImage:
     """Root mean square reprojection error of the corners."""
     reason: str = ""
     """Reason for a missing pose, otherwise empty."""
-    left_out: tuple[tuple[float, float], ...] = ()
+    left_out: tuple[Pair, ...] = ()
     """Pixels x, y of corners that leave their neighbours by many sigma."""
 
 
@@ -88,7 +88,7 @@ class BoardPoses:
     def from_dict(cls, data: object) -> Self:
         """Create board poses from the values of `to_dict`, or raise ValueError."""
 
-        def read(values: Mapping[str, Any]) -> Self:
+        def read(values: Record) -> Self:
             return cls(
                 board=Board.from_dict(values["board"]),
                 camera=Camera.from_dict(values["camera"]),
@@ -184,7 +184,7 @@ def _image_to_dict(image: BoardImage) -> JsonObject:
     return record
 
 
-def _image_from_dict(data: Mapping[str, Any]) -> BoardImage:
+def _image_from_dict(data: Record) -> BoardImage:
     name = str(data["name"])
     pose = data["camera_from_board"]
     if pose is None:

@@ -17,7 +17,7 @@ from scipy.special import ndtri
 from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, cross_matrix, norms
 from evercal.geometry.normal_equations import normal_pseudo_inverse
-from evercal.typing import Array, BoolArray
+from evercal.typing import Array, ArrayPair, BoolArray
 
 MIN_SIGMA_PX = 0.02
 """Minimum standard deviation of a corner, due to errors of camera model and board."""
@@ -252,9 +252,7 @@ def _fitted(
     )
 
 
-def _refined(
-    points: Array, pixels: Array, camera: Camera, start: SE3
-) -> tuple[Array, Array]:
+def _refined(points: Array, pixels: Array, camera: Camera, start: SE3) -> ArrayPair:
     """Rotation vector and translation (3, 1) of the board that fit its corners best."""
     import cv2
 

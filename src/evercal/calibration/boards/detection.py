@@ -20,7 +20,7 @@ from evercal.calibration.boards.markers import (
 from evercal.errors import InputError
 from evercal.geometry import norms
 from evercal.geometry.camera import resize_pixels
-from evercal.typing import Array, Image
+from evercal.typing import Array, Image, Size
 
 _MAX_CHANGE = 0.3
 """Maximum change of the step from corner to corner, relative to the mean step."""
@@ -147,7 +147,7 @@ def _find_chessboard(grey: Image, board: Board) -> Detection:
 
 def _chessboard_candidates(
     grey: Image,
-    size: tuple[int, int],
+    size: Size,
 ) -> Iterator[Array]:
     """Yield corners (k, 2) by OpenCV's finders, the fastest first."""
     normalized = cv2.CALIB_CB_NORMALIZE_IMAGE

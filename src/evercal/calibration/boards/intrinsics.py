@@ -26,7 +26,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.geometry.camera import COEFFICIENTS
 from evercal.geometry.normal_equations import normal_pseudo_inverse, normal_solution
-from evercal.typing import Array
+from evercal.typing import Array, ArrayPair, Pair
 
 LENS = {name: ("fx", "fy", "cx", "cy", *terms) for name, terms in COEFFICIENTS.items()}
 """Names of the intrinsics of each model."""
@@ -131,7 +131,7 @@ def lens_estimate(
     camera: Camera,
     bend: Bend,
     prior: LensPrior,
-) -> tuple[Array, Array]:
+) -> ArrayPair:
     """Estimate the change (q,) of the intrinsics and the bend that board poses were fitted with.
 
     Also return the information (q, q) of the corners and the prior.
@@ -253,7 +253,7 @@ def _misfits(
 def _middle(
     width: int,
     height: int,
-) -> tuple[float, float]:
+) -> Pair:
     return (width - 1) / 2, (height - 1) / 2
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from evercal.calibration.boards.board import Board, dictionary_of
 from evercal.errors import InputError, optional_module
-from evercal.typing import Array, Image
+from evercal.typing import Array, Image, Pair
 
 if TYPE_CHECKING:
     from PIL.Image import Image as PillowImage
@@ -160,7 +160,7 @@ def _sheet(
     board: Board,
     paper: str,
     size_mm: Array,
-) -> tuple[float, float]:
+) -> Pair:
     """Return width and height of the sheet, turned if the board fits only or better so."""
     if paper not in PAPERS_MM:
         raise InputError(
@@ -168,7 +168,7 @@ def _sheet(
         )
     needed = size_mm + np.array([2 * _MARGIN_MM, 2 * _MARGIN_MM + _FOOTER_MM])
 
-    def fitting(name: str) -> tuple[float, float] | None:
+    def fitting(name: str) -> Pair | None:
         short, long = PAPERS_MM[name]
         sheets = [(short, long), (long, short)]
         if size_mm[0] > size_mm[1]:

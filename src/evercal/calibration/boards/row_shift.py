@@ -10,7 +10,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from evercal.calibration.boards.corners import MIN_SIGMA_PX, BoardPose
-from evercal.typing import Array, BoolArray
+from evercal.typing import Array, ArrayPair, BoolArray
 
 _MIN_CORNERS = 16
 """Minimum number of corners of an image that tells a shift from noise."""
@@ -77,7 +77,7 @@ class CornerNoise(NamedTuple):
         return [pose.weighted(ratio) for pose in poses]
 
 
-def _shift(pose: BoardPose) -> tuple[Array, Array]:
+def _shift(pose: BoardPose) -> ArrayPair:
     """Squared signals (4,) of the shift, and their slopes (4,) by its variance.
 
     Both are 0 where a pose explains the shift, so that other errors would be taken for it.

@@ -12,6 +12,7 @@ from evercal.geometry import SE3
 from evercal.robot.robot_model import RobotModel
 from evercal.robot.urdf import parsed_urdf
 from evercal.storage.text_files import named_errors, read_json
+from evercal.typing import JsonObject
 
 _LEROBOT_TICKS = 4095 / 360
 """A degree of LeRobot is this many ticks: it divides by the resolution minus 1."""
@@ -25,7 +26,7 @@ _TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")
 def joint_offsets(export: Export) -> str:
     """Write offset, standard deviation and covariance; null where it is not determined."""
     _determined(export)
-    rows: dict[str, dict[str, object]] = {}
+    rows: dict[str, JsonObject] = {}
     for joint in export.calibration.joints:
         row = rows.setdefault(joint.name, {"open": joint.open})
         units = {"m": 1.0}

@@ -24,7 +24,7 @@ from evercal.recordings.poses.robot_poses import RobotPoses, read_robot_poses
 from evercal.robot.frame_names import FrameNames
 from evercal.robot.mount import mount_named
 from evercal.storage.text_files import read_text, yaml_documents
-from evercal.typing import Array, PathLike
+from evercal.typing import Array, PathLike, Triple
 
 PoseSource: TypeAlias = RobotPoses | PathLike | None
 
@@ -57,7 +57,7 @@ class ExportOptions(TypedDict, total=False):
     """Root frame of the camera driver, which becomes the child frame."""
     via_transform: PathLike | None
     """File with the transforms between the root frame and the optical frame."""
-    via_offset: tuple[float, float, float] | None
+    via_offset: Triple | None
     """Origin of the optical frame in the root frame: forward, left, up, metres."""
     via_optical: bool
     """Whether the two frames share their origin."""
@@ -234,7 +234,7 @@ _EXPECTED = (
 
 
 def standard_link_from_optical(
-    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    offset_m: Triple = (0.0, 0.0, 0.0),
 ) -> SE3:
     """Return the pose of an optical frame whose origin lies forward, left, up in the link."""
     return SE3(np.array([0.5, -0.5, 0.5, -0.5]), np.array(offset_m))

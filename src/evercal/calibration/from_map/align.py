@@ -27,7 +27,7 @@ from evercal.mapping.map_frame import MapFrame, Similarity
 from evercal.mapping.scene_map import SceneMap
 from evercal.recordings.images import Picture
 from evercal.storage.text_files import few
-from evercal.typing import Array, Image, Strings
+from evercal.typing import Array, ArrayPair, Image, Pair, Strings
 
 if TYPE_CHECKING:
     from evercal.localization.localizer import Localizer
@@ -50,7 +50,7 @@ class MapAlignment:
     """Root mean square residual, with its unit."""
     gripper_from_camera: SE3 | None = None
     """Estimated pose of the camera on the gripper, or of the board that it holds."""
-    sigma: tuple[float, float] = (0.0, 0.0)
+    sigma: Pair = (0.0, 0.0)
     """Standard deviation per axis in the middle of the scene, millimetres and degrees."""
     warnings: Strings = ()
     """What the robot's motions contradict."""
@@ -158,7 +158,7 @@ def _located_in(
 
 def _frame_covariance(
     fit: HandEyeFit, similarity: Similarity, map_from_camera: SE3, size: int
-) -> tuple[Array, tuple[float, float]]:
+) -> tuple[Array, Pair]:
     """Covariance of the base frame as one motion of it, and sigmas in the middle of the cameras."""
     whole = fit.covariance
     picked = np.r_[6:12, size]
@@ -313,7 +313,7 @@ def _distances(image: Picks, similarity: Similarity) -> Array:
     return np.nan_to_num(pixels - image.pixels, nan=1e3).ravel()
 
 
-def _triangulated(images: Sequence[Picks]) -> dict[str, tuple[Array, Array]]:
+def _triangulated(images: Sequence[Picks]) -> dict[str, ArrayPair]:
     """Return each point that two images show in the map and in the base, by name."""
     centres = defaultdict(list)
     across = defaultdict(list)

@@ -6,10 +6,10 @@ frame of the gripper. `hand_eye_start` estimates a first transform from pairs of
 bundle adjustment refines it together with all poses and landmarks.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from evercal.mapping.built_map import (
 )
 from evercal.recordings.frame import Frame, stated_grippers
 from evercal.robot.arm_offsets import ArmOffsets
-from evercal.typing import JsonObject, Strings
+from evercal.typing import JsonObject, Pair, Record, Strings
 
 _HOW = ("pairs", "of_pairs", "start_mm", "start_deg", "given_mm", "given_deg", "advice")
 """Fields of `HandEye` that are JSON values."""
@@ -81,7 +81,7 @@ class HandEye:
         }
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any], calibration: Calibration) -> Self:
+    def from_dict(cls, values: Record, calibration: Calibration) -> Self:
         """The inverse of `to_dict`, beside the calibration that is stored with the scene."""
         how = {name: values[name] for name in _HOW}
         return cls(calibration, warnings=tuple(values["warnings"]), **how)
@@ -155,7 +155,7 @@ def _error_terms(correction: HandEyeCorrection) -> tuple[ErrorTerm, ...]:
 
 def _from_given(
     calibration: Calibration, given: SE3 | None
-) -> tuple[float, float] | tuple[None, None]:
+) -> Pair | tuple[None, None]:
     """Distance from a given transform, which is taken to be for the stated intrinsics."""
     if given is None:
         return None, None

@@ -27,7 +27,7 @@ from evercal.geometry import (
     spread,
 )
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES
-from evercal.typing import Array, BoolArray, IntArray
+from evercal.typing import Array, BoolArray, Floats, IntArray, Triple
 
 
 def _covariance(metres: float, radians: float) -> Array:
@@ -75,9 +75,9 @@ class NextViews:
     """(k,) index among the reachable poses."""
     poses: SE3
     """(k,) base_from_gripper."""
-    sigma_mm: tuple[float, ...]
+    sigma_mm: Floats
     """(k + 1,) expected standard deviation per axis: now, and after each pose."""
-    sigma_deg: tuple[float, ...]
+    sigma_deg: Floats
 
 
 def next_views(
@@ -105,7 +105,7 @@ def next_views(
 class OpenPosition:
     """The direction in which the motions of a recording leave `gripper_from_camera` open."""
 
-    direction: tuple[float, float, float]
+    direction: Triple
     """Unit vector in the gripper frame."""
     sigma_mm: float
     """Expected standard deviation along it."""

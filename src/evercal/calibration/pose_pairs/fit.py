@@ -20,7 +20,7 @@ from evercal.calibration.pose_pairs.pose_equation import PoseEquation, System, U
 from evercal.classes import frozen, frozen_arrays
 from evercal.geometry import norms, spread
 from evercal.geometry.normal_equations import normal_solution
-from evercal.typing import Array, BoolArray
+from evercal.typing import Array, ArrayPair, BoolArray
 
 _STUDENT_FREEDOM = 3.0
 """Degrees of freedom of the Student t distribution of the residuals in `agreement`."""
@@ -243,7 +243,7 @@ def _result(
 
 def _distances(
     equation: PoseEquation, at: Unknowns, levels: Array, use: BoolArray
-) -> tuple[Array, Array]:
+) -> ArrayPair:
     """Squared Mahalanobis distances (n,) of each pose from what the other used ones predict.
 
     Also return the residuals (n, 6) of `predicted`.
@@ -272,7 +272,7 @@ def _distances(
 
 def predicted(
     equation: PoseEquation, at: Unknowns, levels: Array, use: BoolArray
-) -> tuple[Array, Array]:
+) -> ArrayPair:
     """Residuals (n, 6) less the errors that poses share, by those that are used.
 
     Also return the covariance (n, 6, 6) of the rest, if the unknowns were known.

@@ -11,7 +11,7 @@ from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.recordings.images import size_in_header
 from evercal.storage.text_files import named_errors
-from evercal.typing import Array
+from evercal.typing import Array, Pair
 
 ENDINGS = (".png", ".npy", ".tif", ".tiff")
 """Endings of depth images."""
@@ -75,7 +75,7 @@ def depth_at(depth: Array, pixel: Array) -> float:
 
 def depth_fit(folder: Path, camera: Camera, target: Target) -> DepthFit:
     """Compare depth images with the corners or landmarks of a target."""
-    rows: list[tuple[float, float]] = []
+    rows: list[Pair] = []
     for name, (pose, points) in target.items():
         depth = read_depth(folder, name, camera)
         places = pose.pose.apply(points)

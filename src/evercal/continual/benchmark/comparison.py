@@ -9,7 +9,7 @@ import pandas as pd
 from evercal.continual.benchmark.results import Table
 from evercal.errors import InputError
 from evercal.evaluation.metrics import ContinualScores, continual_scores
-from evercal.typing import JsonObject
+from evercal.typing import JsonObject, Pair
 
 COARSE_COLUMN = "within_5cm_5deg"
 """Column of results.csv that counts frames within 5 cm and 5 deg."""
@@ -191,9 +191,7 @@ def _contrast_cells(gains: Table, comparisons: int) -> list[object]:
     return [f"{gains.mean():+.1f}", bounds, int((gains > 0).sum())]
 
 
-def seeds_interval(
-    values: Sequence[float], comparisons: int = 1
-) -> tuple[float, float]:
+def seeds_interval(values: Sequence[float], comparisons: int = 1) -> Pair:
     """Estimate a 95 % interval of a mean over runs with other seeds and orders, on the same rooms.
 
     Student's t over the runs. It covers the choice of seed and order, not that of rooms, paths or

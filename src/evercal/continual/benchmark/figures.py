@@ -3,10 +3,10 @@
 The Okabe-Ito colours are distinguishable with colour blindness.
 """
 
-from typing import Any
-
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from evercal.typing import JsonObject
 
 COLOURS = (
     "#0072B2",
@@ -42,7 +42,7 @@ def tidy(panel: Axes) -> None:
     panel.spines[["top", "right"]].set_visible(False)
 
 
-def line_style(index: int, name: str) -> dict[str, Any]:
+def line_style(index: int, name: str) -> JsonObject:
     """Keywords of `plot` that distinguish lines by colour, marker and dashes."""
     return {
         "color": COLOURS[index % len(COLOURS)],

@@ -10,6 +10,7 @@ import pandas as pd
 
 from evercal.continual.benchmark import comparison
 from evercal.continual.benchmark.results import Table
+from evercal.typing import Pair
 
 ABLATIONS: Mapping[str, tuple[tuple[str, str], ...]] = {
     "as printed": (
@@ -42,7 +43,7 @@ TABLE4 = (
     "reservoir_spdd",
 )
 """Strategies of `ABLATIONS`."""
-PUBLISHED: Mapping[str, Mapping[str, tuple[float, float]]] = {
+PUBLISHED: Mapping[str, Mapping[str, Pair]] = {
     "i7s": {
         "joint": (81.7, math.nan),
         "finetune": (1.1, math.nan),

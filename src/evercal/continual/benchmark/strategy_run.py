@@ -44,6 +44,7 @@ from evercal.mapping.store import MapStore
 from evercal.recordings import Recording, stated_poses
 from evercal.recordings.held_out import split_held_out
 from evercal.storage.stages import is_store
+from evercal.typing import JsonObject
 
 NETWORK_LOCALIZE = NetworkLocalizeOptions(refuses=False)
 """Networks answer for every image, as published methods do. A refusal rule would favour methods
@@ -67,7 +68,7 @@ class BenchOptions:
     """Order of the scenes; `shuffled` and `balanced` depend on the seed."""
     short_side: int = 240
     """Working size of images, pixels."""
-    settings: dict[str, object] = field(default_factory=dict)
+    settings: JsonObject = field(default_factory=dict)
     """Further settings that decide the results, for settings.json."""
     device: str = "auto"
     """Device of the networks, see `networks.device.device_of`."""

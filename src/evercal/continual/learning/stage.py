@@ -9,6 +9,7 @@ from evercal.continual.networks.head import HeadOptions
 from evercal.continual.networks.trainer import FitOptions, Progress
 from evercal.errors import require_numbers
 from evercal.mapping.memory_budget import MemoryBudget
+from evercal.typing import Triple
 
 
 @frozen
@@ -25,7 +26,7 @@ class StageOptions:
     """Views of every remembered frame."""
     memory: MemoryBudget = field(default_factory=MemoryBudget)
     """Keyframes of a scene (N_b); what a method keeps beside them is not counted."""
-    fixed_centres_m: tuple[tuple[float, float, float], ...] = ()
+    fixed_centres_m: tuple[Triple, ...] = ()
     """Atlas coordinates of all centres, for HeadOptions.centres `fixed`."""
     grid_scenes: int = 0
     """Scenes of the paper's layout, see `Atlas`; 0 gives each scene the next free cell."""

@@ -13,7 +13,7 @@ import numpy as np
 from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.geometry.se3 import SE3
-from evercal.typing import Array
+from evercal.typing import Array, Triple
 
 MIN_CELL_M = 5.0
 """Minimum side of a scene's cell, and distance of the positions of cells, metres."""
@@ -23,11 +23,11 @@ MIN_CELL_M = 5.0
 class Cell:
     """The square of the atlas that belongs to one scene."""
 
-    centre_m: tuple[float, float, float]
+    centre_m: Triple
     """Atlas coordinates of the scene's mean camera position."""
     side_m: float
     """Side of the square in x and y."""
-    origin_m: tuple[float, float, float]
+    origin_m: Triple
     """Mean camera position in the scene's own base frame."""
 
     @property
@@ -102,7 +102,7 @@ def camera_clusters(positions_m: Array, count: int, seed: int) -> Array:
 
 def combined_centres(
     positions_m: Sequence[Array], count: int, seed: int
-) -> tuple[tuple[float, float, float], ...]:
+) -> tuple[Triple, ...]:
     """Compute the cluster centres of all scenes in the paper's layout.
 
     As in GLACE, k-means runs on the camera positions of all scenes together. These are (n, 3) in

@@ -21,6 +21,7 @@ from torch.nn import functional as F
 
 from evercal.classes import frozen
 from evercal.errors import InputError, require_numbers
+from evercal.typing import Strings
 
 SCALE_MAX = 4.0
 """GLACE's s_max: the reciprocal of the smallest homogeneous coordinate (no unit)."""
@@ -155,7 +156,7 @@ class Head(nn.Module):
         return Head.from_state(self.features, self.descriptor, self.options, state)
 
     @property
-    def owned_by_centres(self) -> tuple[str, ...]:
+    def owned_by_centres(self) -> Strings:
         """Names of the parameters that have a row for each centre."""
         if self.options.offsets == "per_centre":
             return PER_CENTRE

@@ -34,6 +34,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from evercal.errors import InputError
 from evercal.recordings.formats.bags.file import Message
+from evercal.typing import Strings
 
 FIND_S = 5.0
 """Time that a publisher has to appear on the graph, seconds."""
@@ -70,7 +71,7 @@ class Graph:
             self._participant, BuiltinTopicDcpsPublication
         )
 
-    def find(self, topic: str, kinds: tuple[str, ...]) -> "Subscription":
+    def find(self, topic: str, kinds: Strings) -> "Subscription":
         """Read a topic of one of some types as its publishers offer it.
 
         Raises:

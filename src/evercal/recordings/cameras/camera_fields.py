@@ -16,9 +16,9 @@ from evercal.geometry.camera import COEFFICIENT_COUNTS, COEFFICIENTS
 from evercal.recordings.cameras.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.poses.row_files import by_alias, is_number
 from evercal.storage.text_files import few
-from evercal.typing import Array, JsonObject
+from evercal.typing import Array, Floats, JsonObject, Record
 
-Fields = Mapping[str, Any]
+Fields = Record
 """Values by name."""
 Size = tuple[int, int]
 """Width and height, pixels."""
@@ -199,7 +199,7 @@ def _of_radial_model(kind: str, fields: Fields, size: tuple[Any, Any]) -> Camera
     return nearest_fisheye(kind, parameters, (width, height), (fx, fy), (cx, cy))
 
 
-def _distortion(fields: Fields, model: str) -> tuple[float, ...] | None:
+def _distortion(fields: Fields, model: str) -> Floats | None:
     """Coefficients in OpenCV's order; None if there is no field of them."""
     names = COEFFICIENTS[model]
     stated = [name for name in _PINHOLE if fields.get(name)]
@@ -227,9 +227,7 @@ def _distortion(fields: Fields, model: str) -> tuple[float, ...] | None:
     return tuple(numbers)
 
 
-def _refuse_other_models(
-    models: Mapping[str, object], distortion: tuple[float, ...]
-) -> None:
+def _refuse_other_models(models: Mapping[str, object], distortion: Floats) -> None:
     """Refuse models other than OpenCV's, which `none` and `zero` are without coefficients."""
     for kind, model in models.items():
         if kind in ("brown", "fisheye"):

@@ -27,7 +27,7 @@ from evercal.storage.text_files import (
     natural_key,
     path_inside,
 )
-from evercal.typing import Array
+from evercal.typing import Array, Size
 
 _MODEL_FOLDERS = (".", "sparse", "colmap/sparse", "distorted/sparse")
 """Usual places of models; distorted/sparse is before undistortion."""
@@ -213,7 +213,7 @@ def _stored_image(stream: BinaryIO) -> Sequence[Any]:
     return *numbers, name.decode(errors="replace")
 
 
-def _camera(model: str, size: tuple[int, int], numbers: Array) -> Camera:
+def _camera(model: str, size: Size, numbers: Array) -> Camera:
     names = _PARAMETERS.get(model, "").split()
     if not names:
         supported = [name for name, parameters in _PARAMETERS.items() if parameters]

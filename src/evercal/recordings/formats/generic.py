@@ -6,7 +6,7 @@ ignored.
 
 import contextlib
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self, TypeAlias
@@ -28,7 +28,7 @@ from evercal.storage.text_files import (
     read_json,
     refuse_repeated,
 )
-from evercal.typing import JsonObject, PathLike, Strings
+from evercal.typing import JsonObject, PathLike, Record, Strings
 
 FILE = "scene.json"
 """File that lists the frames."""
@@ -65,7 +65,7 @@ def load(root: Path) -> Recording:
     )
 
 
-def _frames(root: Path, data: Mapping[str, Any]) -> dict[Split, list[Frame]]:
+def _frames(root: Path, data: Record) -> dict[Split, list[Frame]]:
     entries = data.get("frames")
     notes = data.get("notes", [])
     if not isinstance(entries, list) or not entries:

@@ -6,9 +6,8 @@ joints of observation.state. `gripper_frame` selects the feature if several hold
 such as left_ee, if one feature holds left_ee.x and right_ee.x.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from evercal.errors import InputError
 from evercal.recordings.poses.conventions import (
@@ -21,9 +20,9 @@ from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import named_errors, refuse_repeated
-from evercal.typing import Array
+from evercal.typing import Array, Record
 
-Info: TypeAlias = Mapping[str, Any]
+Info: TypeAlias = Record
 """Content of info.json, or of a feature in it."""
 _STATE = "observation.state"
 """Feature of the joints."""

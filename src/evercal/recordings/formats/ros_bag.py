@@ -44,7 +44,7 @@ from evercal.recordings.images import (
 from evercal.recordings.poses.pose_track import MAX_GAP_S
 from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import named_errors
-from evercal.typing import Image, JsonObject
+from evercal.typing import Image, JsonObject, Size
 
 
 def _encodings(table: str) -> dict[str, tuple[int, int, str]]:
@@ -211,7 +211,7 @@ def _shots(bag: BagFile, topic: str) -> tuple[list[BagImage], list[str]]:
     return sorted(shots, key=lambda shot: shot.stamp_ns), notes
 
 
-def _bag_camera(bag: BagFile, image_topic: str, size: tuple[int, int]) -> Camera:
+def _bag_camera(bag: BagFile, image_topic: str, size: Size) -> Camera:
     """The first camera_info beside an image topic."""
     topics = bag.topics(CAMERA_INFO)
     beside = info_topic(image_topic)
@@ -229,9 +229,7 @@ def info_topic(image_topic: str) -> str:
     return f"{image.rpartition('/')[0]}/camera_info"
 
 
-def camera_info_of(
-    source: str, message: Any, image_size: tuple[int, int], topic: str
-) -> Camera:
+def camera_info_of(source: str, message: Any, image_size: Size, topic: str) -> Camera:
     """Decode a sensor_msgs/CameraInfo from `source`, for images of (width, height) on a topic.
 
     Rectified images take P without distortion, others K and D.
@@ -243,7 +241,7 @@ def camera_info_of(
     return camera
 
 
-def _camera(message: Any, image_size: tuple[int, int], rectified: bool) -> Camera:
+def _camera(message: Any, image_size: Size, rectified: bool) -> Camera:
     k = _numbers(message, "k")
     if not any(k):
         raise ValueError("K is all zeros: the camera is not calibrated; give `camera`")

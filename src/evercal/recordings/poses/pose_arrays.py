@@ -3,7 +3,6 @@
 import re
 from collections.abc import Mapping
 from itertools import product
-from typing import Any
 
 import numpy as np
 
@@ -11,9 +10,9 @@ from evercal.geometry import rotation_error
 from evercal.recordings.poses.conventions import Given
 from evercal.recordings.poses.pose_columns import HEADERS, PoseTable, named_numbers
 from evercal.recordings.poses.row_files import name_and_unit, number_array, text_cells
-from evercal.typing import Array
+from evercal.typing import Array, Record
 
-Columns = Mapping[str, Any]
+Columns = Record
 """Values by key: of one pose, or lists of the values of all poses."""
 Shape = tuple[int, ...]
 """Lengths of nested lists."""

@@ -39,6 +39,7 @@ from evercal.recordings.poses.row_files import (
 )
 from evercal.robot.frame_names import FrameNames
 from evercal.storage.text_files import natural_key
+from evercal.typing import JsonObject
 
 _KEYS = (
     "poses",
@@ -194,7 +195,7 @@ def _of_object(data: Columns, given: Given, robot: bool) -> PoseTable:
     return pose_data(rows, given, robot)
 
 
-def _rows_of(columns: Columns) -> list[dict[str, Any]]:
+def _rows_of(columns: Columns) -> list[JsonObject]:
     """An object for each pose, of the lists of its keys."""
     poses = zip(*columns.values(), strict=True)
     return [dict(zip(columns, values, strict=True)) for values in poses]
@@ -235,8 +236,8 @@ def _unclear(keys: Sequence[str], data: Columns) -> ValueError:
 def _of_role(columns: Columns, given: Given, robot: bool) -> Columns:
     """Columns of the robot or of the camera without that word, and of neither."""
     keys = []
-    of_role: dict[str, Any] = {}
-    others: dict[str, Any] = {}
+    of_role: JsonObject = {}
+    others: JsonObject = {}
     for key, value in columns.items():
         match = _ROLES[robot].fullmatch(key)
         if match:
@@ -317,9 +318,9 @@ def _is_object(value: object) -> bool:
     return isinstance(value, Mapping)
 
 
-def _flat(entry: Columns) -> dict[str, Any]:
+def _flat(entry: Columns) -> JsonObject:
     """Values of nested objects; the stamp of a ROS message as seconds."""
-    cells: dict[str, Any] = {}
+    cells: JsonObject = {}
     for key, value in entry.items():
         require_at_most(len(key), "name_characters", "characters of a key")
         if not isinstance(value, Mapping):
@@ -333,9 +334,9 @@ def _flat(entry: Columns) -> dict[str, Any]:
     return cells
 
 
-def _cells(row: Columns) -> dict[str, object]:
+def _cells(row: Columns) -> JsonObject:
     """One value a column: those of a list are columns of their own."""
-    cells: dict[str, object] = {}
+    cells: JsonObject = {}
     for key, value in row.items():
         order = key[-4:].lower()
         names = _LISTS.get(key) or _QUATERNIONS.get(order)

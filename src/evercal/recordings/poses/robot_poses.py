@@ -36,7 +36,7 @@ from evercal.storage.text_files import (
     read_text,
     refuse_repeated,
 )
-from evercal.typing import Array, PathLike
+from evercal.typing import Array, Floats, PathLike
 
 POSE_ENDINGS = (
     ".csv",
@@ -86,7 +86,7 @@ class RobotPoses:
         """Number of poses."""
         return len(self.poses)
 
-    def joints_of(self, row: int) -> tuple[float, ...] | None:
+    def joints_of(self, row: int) -> Floats | None:
         """Joint values of a row, if they are stated."""
         if self.joints is None:
             return None

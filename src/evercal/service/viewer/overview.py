@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from evercal.typing import Array
+from evercal.typing import Array, ArrayPair, Size
 
 FOV_RAD = np.deg2rad(50.0)
 """Vertical angle of view."""
@@ -18,9 +18,7 @@ _MARGIN = 0.92
 """Share of the picture that is used."""
 
 
-def overview(
-    points_m: Array, ahead: Array, size_px: tuple[int, int]
-) -> tuple[Array, Array]:
+def overview(points_m: Array, ahead: Array, size_px: Size) -> ArrayPair:
     """Position and target of a view that shows points (n, 3) in a picture.
 
     The visitor looks to `ahead` (3,), whose height does not count.

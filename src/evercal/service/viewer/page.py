@@ -33,7 +33,7 @@ from evercal.service.viewer.html import (
     rows_html,
 )
 from evercal.service.viewer.overview import FOV_RAD, overview
-from evercal.typing import Array
+from evercal.typing import ArrayPair, Size
 
 _THROUGH = "/through"
 """Node of the image behind the landmarks of a keyframe."""
@@ -130,7 +130,7 @@ class Page:
             camera.look_at = target
         self.map.show_keyframes(True)
 
-    def _overview(self, size_px: tuple[int, int]) -> tuple[Array, Array]:
+    def _overview(self, size_px: Size) -> ArrayPair:
         """Landmarks, base, calibrations and gripper."""
         scene = chosen(self._scene)
         points = self.map.landmarks[scene].points_m

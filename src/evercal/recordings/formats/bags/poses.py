@@ -21,7 +21,7 @@ from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.frame_names import FrameNames
 from evercal.robot.robot_model import RobotModel
-from evercal.typing import Array, BoolArray, IntArray
+from evercal.typing import Array, BoolArray, IntArray, Pair
 
 
 @frozen_arrays
@@ -133,11 +133,9 @@ def _from_joints(
 
 def _joint_tracks(
     bag: BagFile, topics: Sequence[str], zero_ns: int
-) -> dict[str, dict[str, list[tuple[float, float]]]]:
+) -> dict[str, dict[str, list[Pair]]]:
     """By joint and topic: pairs of seconds after `zero_ns` and position."""
-    tracks: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(
-        lambda: defaultdict(list)
-    )
+    tracks: dict[str, dict[str, list[Pair]]] = defaultdict(lambda: defaultdict(list))
     for message in bag.messages(topics):
         stamp = message.seconds(message.content.header, zero_ns)
         for name, position in zip(

@@ -12,7 +12,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3
 from evercal.recordings.formats.bags.file import Message
 from evercal.recordings.poses.pose_track import PoseTrack
-from evercal.typing import Array, BoolArray, Strings
+from evercal.typing import Array, BoolArray, Floats, Strings
 
 STATIC = "tf_static"
 """End of a topic whose transforms hold for all times."""
@@ -50,9 +50,9 @@ class _Transform(NamedTuple):
     child: str
     stamp_s: float | None
     """None if static."""
-    quaternion: tuple[float, ...]
+    quaternion: Floats
     """w, x, y, z."""
-    translation: tuple[float, ...]
+    translation: Floats
     """Metres."""
 
     def is_rigid(self) -> bool:
