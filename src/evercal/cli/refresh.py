@@ -62,7 +62,7 @@ class Refresh(args.Verb):
                 camera = None
                 if recording.train:
                     first = recording.train[0].camera
-                    shape = (first.width, first.height)
+                    shape = first.size
                     camera = args.stated_camera(self.camera, shape)
                 report = cell.refresh(recording, camera=camera, on_progress=bars.step)
             else:

@@ -181,7 +181,7 @@ class Verify(args.Verb):
 
         if self.board_poses is not None:
             boards = read_board_poses(self.board_poses)
-            _require_size(calibration, (boards.camera.width, boards.camera.height))
+            _require_size(calibration, boards.camera.size)
             target = board_target(boards)
             return target, self._grippers({name: Path(name) for name in target})
         if self.store is None:
@@ -199,7 +199,7 @@ class Verify(args.Verb):
 
 def _require_size(calibration: "Calibration", size: tuple[int, int]) -> None:
     camera = calibration.camera
-    if camera is not None and (camera.width, camera.height) != size:
+    if camera is not None and camera.size != size:
         raise InputError(
             f"the images are {size[0]}x{size[1]}, those of the calibration"
             f" {camera.width}x{camera.height}; give images and calibration of one camera"

@@ -56,7 +56,7 @@ def fit_threshold(
         if metres < _NEAR_M and radians < _NEAR_RAD:
             squared.append(pose.squared_mahalanobis(frame.base_from_camera))
     small = records[index].camera.short_side_resized(scenes.short_side)
-    others = _negative_views(small.width, small.height)
+    others = _negative_views(*small.size)
     negatives = [localizer.localize(image).inlier_ratio for image in others]
     high = float(np.quantile(negatives, 0.95))
     low = float(np.quantile(positives or [1.0], 0.05))

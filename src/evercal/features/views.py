@@ -160,7 +160,7 @@ def working_image(
     if image.ndim == 3:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     small = camera.short_side_resized(short_side)
-    size = small.width, small.height
+    size = small.size
     if grey.shape != (small.height, small.width):
         if small.height < grey.shape[0]:
             grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)

@@ -27,7 +27,7 @@ from evercal.geometry.distortion import (
     widest_fisheye,
     widest_pinhole,
 )
-from evercal.typing import Array, ArrayPair, Floats, JsonObject, Strings
+from evercal.typing import Array, ArrayPair, Floats, JsonObject, Size, Strings
 
 COEFFICIENTS: dict[str, Strings] = {
     "pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
@@ -132,6 +132,11 @@ class Camera:
         )
 
     @property
+    def size(self) -> Size:
+        """Width and height of its images, pixels."""
+        return self.width, self.height
+
+    @property
     def coefficients(self) -> Floats:
         """All eight distortion coefficients; missing ones are 0."""
         return (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
@@ -202,7 +207,7 @@ class Camera:
 
     def short_side_resized(self, short_side: int) -> "Camera":
         """The camera of the image resized so that its shorter side is `short_side` pixels."""
-        scale = short_side / min(self.width, self.height)
+        scale = short_side / min(self.size)
         width = short_side
         height = short_side
         if self.width <= self.height:

@@ -47,8 +47,8 @@ def fit_rays(own: Camera, other: Camera) -> RayFit:
     Raises:
         ValueError: The images differ in size, or the distortion leaves no rays.
     """
-    size = (own.width, own.height)
-    if size != (other.width, other.height):
+    size = own.size
+    if size != other.size:
         raise ValueError("the intrinsics differ in image size; give both for one size")
     across = np.linspace(*MIDDLE, 8)
     pixels = np.stack(np.meshgrid(across, across), -1).reshape(-1, 2)

@@ -180,7 +180,7 @@ def intrinsics_sigma(changes: Array, measured: Array, camera: Camera) -> Triple:
     expectation maximisation: a change c that was measured with the covariance M has the mean K c
     and the covariance V - K V, K = V / (V + M).
     """
-    side = max(camera.width, camera.height)
+    side = max(camera.size)
     variances = SAME_MODEL.variances(camera)
     for _ in range(ITERATIONS):
         gain = variances[:, None] * np.linalg.inv(measured + np.diag(variances))

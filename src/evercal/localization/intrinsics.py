@@ -49,13 +49,13 @@ class IntrinsicsPrior:
 
     def variances(self, camera: Camera) -> Array:
         """(5,) variances of a change of intrinsics, see `Camera.changed`."""
-        centre = self.centre * max(camera.width, camera.height)
+        centre = self.centre * max(camera.size)
         return np.square([self.focal, centre, centre, self.k1, self.k2])
 
     def scattered(self, camera: Camera) -> Array:
         """(5,) variances of intrinsics from image to image."""
         focal, share, distortion = self.scatter
-        centre = share * max(camera.width, camera.height)
+        centre = share * max(camera.size)
         return np.square([focal, centre, centre, distortion, distortion])
 
     def tested(self, camera: Camera, change: Array, measured: Array) -> Array:
@@ -211,7 +211,7 @@ def cameras_in_scenes(
 def _own(recorded: Camera, width: int, height: int) -> Camera:
     if recorded.fits(width, height):
         return recorded.resized(width, height)
-    scale = max(width, height) / max(recorded.width, recorded.height)
+    scale = max(width, height) / max(recorded.size)
     middle = (width - 1) / 2, (height - 1) / 2
     return Camera(width, height, scale * recorded.fx, scale * recorded.fy, *middle)
 
@@ -237,7 +237,7 @@ def _stated_prior(
         return STATED
     recorded = scene.camera
     height, width = image.shape[:2]
-    if (width, height) == (recorded.width, recorded.height):
+    if (width, height) == recorded.size:
         return NOT_STATED
     larger = max(width, recorded.width)
     smaller = min(width, recorded.width)

@@ -117,7 +117,7 @@ def _reason(coefficients: Array, sizes: Array, camera: Camera) -> str:
     stretch = abs(coefficients[2] - coefficients[5])
     shear = abs(coefficients[3] + coefficients[4])
     if quadratic > linear:
-        px = quadratic * max(camera.width, camera.height) / 2
+        px = quadratic * max(camera.size) / 2
         return f"the image is bent by {px:.0f} px: it is not as a camera took it"
     if shear > stretch:
         px = shear * camera.height
@@ -176,7 +176,7 @@ def _weighted(observed: Observed, camera: Camera, pose: SE3) -> _Equations:
 
 def _monomials(pixels: Array, camera: Camera) -> Array:
     """(12, 2, n) displacements by each coefficient: of columns and rows by turns."""
-    half = max(camera.width, camera.height) / 2
+    half = max(camera.size) / 2
     x, y = (pixels.T + 0.5 - [[camera.width / 2], [camera.height / 2]]) / half
     values = np.stack(
         [

@@ -228,7 +228,7 @@ def robust_variance(squares: Array) -> float:
 
 def cells_of(pixels: Array, camera: Camera) -> Array:
     """(n, cells) 1 where a pixel (n, 2) lies in a cell of the image."""
-    side = min(camera.width, camera.height) / SHARED_CELLS
+    side = min(camera.size) / SHARED_CELLS
     cell = (pixels // side).astype(np.int64) @ [1, 1000]
     return (cell[:, None] == np.unique(cell)).astype(float)
 

@@ -306,7 +306,7 @@ def _finish(
     frames = prepared.frames
     numbers = np.array([keyframe.frame for keyframe in tracks])
     stated = frames.frames[0].camera
-    camera = frames.cameras[0].resized(stated.width, stated.height)
+    camera = frames.cameras[0].resized(*stated.size)
     adjusted = Adjusted()
     frame = MapFrame()
     hand_eye = None

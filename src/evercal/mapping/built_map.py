@@ -85,7 +85,7 @@ class Adjusted:
         """
         tangent = adjustment.common.log()
         covariance = adjustment.common_covariance + adjustment.common_systematic
-        size = (stated.width, stated.height)
+        size = stated.size
         unit_square = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
         corners = unit_square * size - 0.5
         moved = norms(camera.project(stated.unproject(corners)) - corners)

@@ -45,7 +45,7 @@ def require_consistent(scene: SceneMap) -> None:
     """Raise an error where the parts of a scene contradict each other."""
     keyframes = scene.keyframes
     for camera in (scene.camera, scene.adjusted_camera):
-        require_image_size(camera.width, camera.height, "camera")
+        require_image_size(*camera.size, "camera")
         _require_small("camera", camera.fx, camera.fy, camera.cx, camera.cy)
     _require_small("poses", keyframes.base_from_camera.translation_m)
     descriptors = keyframes.descriptors
@@ -98,7 +98,7 @@ def require_landmarks(arrays: Record, cameras: Sequence[Camera]) -> None:
     depths = np.minimum(
         arrays["landmark_inverse_depth"][:], arrays["landmark_sigma"][:]
     )
-    sides = [(camera.width, camera.height) for camera in cameras]
+    sides = [camera.size for camera in cameras]
     size = np.repeat(np.array(sides, np.int32), counts, axis=0)
     _require(len(pixels), "a scene has landmarks")
     inside = (pixels >= 0) & (pixels < size)
@@ -111,7 +111,7 @@ def require_landmarks(arrays: Record, cameras: Sequence[Camera]) -> None:
 def _require_keyframe(keyframes: Keyframes, i: int) -> None:
     name = f"keyframe {i}"
     camera = keyframes.cameras[i]
-    size = (camera.width, camera.height)
+    size = camera.size
     require_image_size(*size, name)
     most = bounds().map_side
     _require(max(size) <= most, f"{name}: {size} pixels, at most {most} a side")

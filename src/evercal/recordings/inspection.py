@@ -146,7 +146,7 @@ def _require_image_sizes(frames: Sequence[Frame]) -> None:
     """Refuse images of another size than their camera's; one image of each size is read."""
     sizes = set()
     for frame in frames:
-        size = (frame.camera.width, frame.camera.height)
+        size = frame.camera.size
         if size not in sizes:
             frame.read_image()
         sizes.add(size)
@@ -172,9 +172,9 @@ def _camera_lines(cameras: Counter[Camera]) -> Iterator[str]:
         for camera, count in cameras.items():
             yield f"{_camera_line(camera)}; {count} frames"
         return
-    sizes = [(camera.width, camera.height) for camera in cameras]
+    sizes = [camera.size for camera in cameras]
     for size in dict.fromkeys(sizes):
-        group = [camera for camera in cameras if (camera.width, camera.height) == size]
+        group = [camera for camera in cameras if camera.size == size]
         focal = [camera.fx for camera in group]
         count = sum(cameras[camera] for camera in group)
         yield (

@@ -94,7 +94,7 @@ def _window(corners: Array, camera: Camera) -> tuple[slice, slice] | None:
     if depths.min() <= NEAR_M:
         return slice(0, camera.height), slice(0, camera.width)
     pixels = camera.project(corners)
-    size = (camera.width, camera.height)
+    size = camera.size
     low = np.floor(pixels.min(0))
     high = np.ceil(pixels.max(0)) + 1
     start = np.maximum(low, 0).astype(int)

@@ -199,7 +199,7 @@ class VirtualCell:
         middle_from_base = base_from_flange(_ARM_POSES_RAD[:, 0]).inverse()
         unit_cube = np.indices((2, 2, 2)).reshape(3, 8).T
         corners = THING_LOW_M + THING_SIZE_M * unit_cube
-        image = (self.intrinsics.width, self.intrinsics.height)
+        image = self.intrinsics.size
 
         def usable(gripper: SE3) -> bool:
             points = gripper.apply(corners)

@@ -93,7 +93,7 @@ class LensPrior(NamedTuple):
         """Prior of unknown intrinsics; `camera` gives image size and a rough focal length."""
         mean = np.zeros(len(lens_vector(camera)))
         mean[:2] = camera.fx
-        mean[2:4] = _middle(camera.width, camera.height)
+        mean[2:4] = _middle(*camera.size)
         centre_px = _CENTRE_SIGMA * camera.width
         distortion = _DISTORTION_SIGMA[camera.model]
         prior = cls._around(mean, centre_px, distortion)

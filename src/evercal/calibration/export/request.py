@@ -207,7 +207,7 @@ def _for_lens(calibration: FramedPose, lens: Camera | PathLike | None) -> Framed
     if lens in ("stated", "estimated"):
         return calibration.for_lens(str(lens))
     own = calibration.camera
-    return calibration.for_lens(read_camera(lens, own and (own.width, own.height)))
+    return calibration.for_lens(read_camera(lens, own and own.size))
 
 
 def _link_from_optical(optical: str, options: ExportOptions) -> SE3:

@@ -58,7 +58,7 @@ def reduced(
     if min(image.shape[:2]) <= short_side:
         return replace(frame, image=image)
     camera = frame.camera.short_side_resized(short_side)
-    size = camera.width, camera.height
+    size = camera.size
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return replace(frame, image=np.asarray(small, np.uint8), camera=camera)
 

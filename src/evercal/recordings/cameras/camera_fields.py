@@ -161,7 +161,7 @@ def camera_of(data: Fields, size: Size | None) -> Camera:
     _refuse_unknown(data)
     camera = Camera.from_matrix(matrix, width, height)
     camera = replace(camera, distortion=distortion, model=model)
-    if size != (camera.width, camera.height):
+    if size != camera.size:
         camera = _binned(camera, fields)
     _refuse_misfit(camera)
     return camera

@@ -80,7 +80,7 @@ def camera_from_fields(data: Fields, size: Size | None = None) -> Camera:
     descriptions = []
     for name, camera in cameras.items():
         distinct.add(camera)
-        if (camera.width, camera.height) == size:
+        if camera.size == size:
             fitting.add(camera)
         pixels = f"{camera.width}x{camera.height}"
         descriptions.append(f"{name} ({pixels}, fx {camera.fx:.1f})")

@@ -267,7 +267,7 @@ def _resized(file: Path, frames: list[Frame]) -> list[Frame]:
     resized = []
     for frame in frames:
         camera = frame.camera
-        stated = (camera.width, camera.height)
+        stated = camera.size
         assert isinstance(frame.image, Path)
         if stated not in readers and is_readable(frame.image):
             readers[stated] = _reader(frame.image, stated, file.name)

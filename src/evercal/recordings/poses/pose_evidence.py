@@ -179,7 +179,7 @@ def _features(frame: Frame) -> tuple[Array, Float32Array]:
     """(n, 2) points of the plane z = 1, and their SIFT descriptors."""
     image = cv2.cvtColor(frame.read_image(), cv2.COLOR_RGB2GRAY)
     camera = frame.camera
-    scale = LONG_SIDE / max(camera.width, camera.height)
+    scale = LONG_SIDE / max(camera.size)
     if scale < 1:
         width = round(camera.width * scale)
         height = round(camera.height * scale)
