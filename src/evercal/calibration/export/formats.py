@@ -30,86 +30,74 @@ _HOLD_INTRINSICS = ("camera_info", "opencv", "colmap", "nerfstudio")
 class Exporter:
     """One export format; every format takes fixed cameras and cameras on the arm."""
 
-    frame: Literal["tf", "optical", "any"]
-    """Child frame. `tf`: a frame of the robot's tf tree. `optical`: only the camera's optical
-    frame, so `via` is refused. `any`: plain numbers of either frame."""
     write: Callable[[Export], Content]
     """Writes the content of the file."""
     ending: str
     """Usual ending of the file; empty for a folder."""
     description: str
     """One line for `--format list`."""
+    frame: Literal["tf", "optical", "any"] = "any"
+    """Child frame. `tf`: a frame of the robot's tf tree. `optical`: only the camera's optical
+    frame, so `via` is refused. `any`: plain numbers of either frame."""
     per_image: bool = False
     """Whether a camera on the arm needs the robot's pose of every image."""
 
 
 FORMATS: dict[str, Exporter] = {
     "easy_handeye2": Exporter(
-        "tf", to.easy_handeye2, ".calib", "for ~/.ros2/easy_handeye2"
+        to.easy_handeye2, ".calib", "for ~/.ros2/easy_handeye2", "tf"
     ),
     "easy_handeye": Exporter(
-        "tf", to.easy_handeye, ".yaml", "for ~/.ros/easy_handeye of ROS 1"
+        to.easy_handeye, ".yaml", "for ~/.ros/easy_handeye of ROS 1", "tf"
     ),
     "moveit_samples": Exporter(
-        "optical", to.moveit, ".yaml", "MoveIt Calibration's pairs", True
+        to.moveit, ".yaml", "MoveIt Calibration's pairs", "optical", True
     ),
     "static_transform_publisher": Exporter(
-        "tf", to.command, ".sh", "shell command for ROS 2"
+        to.command, ".sh", "shell command for ROS 2", "tf"
     ),
     "launch_py": Exporter(
-        "tf", to.launch_py, ".launch.py", "ROS 2 launch file with a tf publisher"
+        to.launch_py, ".launch.py", "ROS 2 launch file with a tf publisher", "tf"
     ),
     "ros1_launch": Exporter(
-        "tf", to.ros1_launch, ".launch", "ROS 1 launch file, like MoveIt's"
+        to.ros1_launch, ".launch", "ROS 1 launch file, like MoveIt's", "tf"
     ),
     "transform_stamped": Exporter(
-        "tf", to.stamped, ".yaml", "geometry_msgs/TransformStamped"
+        to.stamped, ".yaml", "geometry_msgs/TransformStamped", "tf"
     ),
-    "camera_info": Exporter("optical", to.camera_info, ".yaml", "intrinsics for ROS"),
+    "camera_info": Exporter(to.camera_info, ".yaml", "intrinsics for ROS", "optical"),
     "urdf": Exporter(
-        "tf", to.urdf, ".urdf", "fixed joint for a URDF, rpy about fixed axes"
+        to.urdf, ".urdf", "fixed joint for a URDF, rpy about fixed axes", "tf"
     ),
-    "opencv": Exporter("optical", to.opencv, ".yml", "rvec and tvec, parent to camera"),
-    "csv": Exporter(
-        "any", to.csv, ".csv", "4x4 matrix, metres, one matrix row per line"
-    ),
-    "npy": Exporter("any", to.npy, ".npy", "4x4 matrix, metres, for numpy"),
+    "opencv": Exporter(to.opencv, ".yml", "rvec and tvec, parent to camera", "optical"),
+    "csv": Exporter(to.csv, ".csv", "4x4 matrix, metres, one matrix row per line"),
+    "npy": Exporter(to.npy, ".npy", "4x4 matrix, metres, for numpy"),
     "json": Exporter(
-        "any", to.as_json, ".json", "matrix, quaternion wxyz, covariance, frames"
+        to.as_json, ".json", "matrix, quaternion wxyz, covariance, frames"
     ),
     "tum": Exporter(
-        "optical", to.tum, ".tum", "stamp, translation, quaternion x y z w", True
+        to.tum, ".tum", "stamp, translation, quaternion x y z w", "optical", True
     ),
     "colmap": Exporter(
-        "optical", to.colmap, "", "a model without points (folder)", True
+        to.colmap, "", "a model without points (folder)", "optical", True
     ),
-    "nerfstudio": Exporter("optical", to.nerfstudio, ".json", "transforms.json", True),
-    "zivid": Exporter(
-        "any", to.zivid, ".txt", "4x4 matrix in millimetres for Zivid's SDK"
-    ),
-    "ur": Exporter("any", to.ur, ".txt", "Universal Robots: p[x, y, z, rx, ry, rz]"),
-    "kuka": Exporter(
-        "any", to.kuka, ".txt", "KUKA: {X, Y, Z, A, B, C}, mm and degrees"
-    ),
-    "abb": Exporter("any", to.abb, ".txt", "ABB: [[x,y,z],[q1,q2,q3,q4]], mm"),
-    "fanuc": Exporter("any", to.fanuc, ".txt", "FANUC: X Y Z W P R, mm and degrees"),
-    "yaskawa": Exporter(
-        "any", to.yaskawa, ".txt", "Yaskawa: X Y Z Rx Ry Rz, mm and degrees"
-    ),
-    "staubli": Exporter(
-        "any", to.staubli, ".txt", "Staubli: X Y Z RX RY RZ, mm and degrees"
-    ),
-    "franka": Exporter(
-        "any", to.franka, ".txt", "Franka: 16 numbers by column, metres"
-    ),
+    "nerfstudio": Exporter(to.nerfstudio, ".json", "transforms.json", "optical", True),
+    "zivid": Exporter(to.zivid, ".txt", "4x4 matrix in millimetres for Zivid's SDK"),
+    "ur": Exporter(to.ur, ".txt", "Universal Robots: p[x, y, z, rx, ry, rz]"),
+    "kuka": Exporter(to.kuka, ".txt", "KUKA: {X, Y, Z, A, B, C}, mm and degrees"),
+    "abb": Exporter(to.abb, ".txt", "ABB: [[x,y,z],[q1,q2,q3,q4]], mm"),
+    "fanuc": Exporter(to.fanuc, ".txt", "FANUC: X Y Z W P R, mm and degrees"),
+    "yaskawa": Exporter(to.yaskawa, ".txt", "Yaskawa: X Y Z Rx Ry Rz, mm and degrees"),
+    "staubli": Exporter(to.staubli, ".txt", "Staubli: X Y Z RX RY RZ, mm and degrees"),
+    "franka": Exporter(to.franka, ".txt", "Franka: 16 numbers by column, metres"),
     "joint_offsets": Exporter(
-        "any", arm.joint_offsets, ".json", "offsets of the arm's joints"
+        arm.joint_offsets, ".json", "offsets of the arm's joints"
     ),
     "corrected_urdf": Exporter(
-        "any", arm.corrected_urdf, ".urdf", "`urdf` with these offsets"
+        arm.corrected_urdf, ".urdf", "`urdf` with these offsets"
     ),
     "lerobot": Exporter(
-        "any", arm.lerobot, ".json", "`lerobot_calibration` with these offsets"
+        arm.lerobot, ".json", "`lerobot_calibration` with these offsets"
     ),
 }
 """All formats by name, an `ExportFormat`."""

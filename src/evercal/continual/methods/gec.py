@@ -104,7 +104,7 @@ class _ConstraintHooks(MemoryHooks):
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
         if self._steps >= self._method.warm_steps:
             return None
-        return Reprojection()(output, None, rows, tau_px)
+        return Reprojection()(output, output, rows, tau_px)
 
     def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:
         count = len(rows.scene) // len(self.memories)  # rows are ordered by scene

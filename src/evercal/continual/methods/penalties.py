@@ -27,18 +27,13 @@ class Penalty:
     """Loss of replayed rows; subclasses implement it."""
 
     needs_teacher: ClassVar[bool] = True
-    """Whether the output of the head before the stage is needed (one more forward pass)."""
+    """Whether the output of the head before the stage is needed (one more forward pass); without it
+    `teacher` may be any."""
 
     def __call__(
-        self, student: HeadOutput, teacher: HeadOutput | None, rows: Rows, tau_px: float
-    ) -> Tensor:
-        """Compute the loss in pixels; `tau_px` is the soft clamp of new rows in this step."""
-        assert teacher is not None or not self.needs_teacher
-        return self._loss(student, teacher or student, rows, tau_px)
-
-    def _loss(
         self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
     ) -> Tensor:
+        """Compute the loss in pixels; `tau_px` is the soft clamp of new rows in this step."""
         raise NotImplementedError
 
 
@@ -57,9 +52,10 @@ class Reprojection(Penalty):
 
     needs_teacher = False
 
-    def _loss(
+    def __call__(
         self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
     ) -> Tensor:
+        """Compute the loss in pixels."""
         return _reprojection(student, rows, tau_px)
 
 
@@ -74,9 +70,10 @@ class OldOutput(Penalty):
     px_per_m: float = PX_PER_M
     """Weight of the distance, pixels per metre."""
 
-    def _loss(
+    def __call__(
         self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
     ) -> Tensor:
+        """Compute the loss in pixels."""
         distance = _distance_m(student, teacher).mean()
         return _reprojection(student, rows, tau_px) + self.px_per_m * distance
 
@@ -92,9 +89,10 @@ class BoundedByTeacher(Penalty):
     px_per_m: float = PX_PER_M
     """Weight of the distance to the teacher's points, pixels per metre."""
 
-    def _loss(
+    def __call__(
         self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
     ) -> Tensor:
+        """Compute the loss in pixels."""
         _, error = fixed_clamp_loss(student.points, rows.target)
         _, bound = fixed_clamp_loss(teacher.points, rows.target)
         distance = _distance_m(student, teacher)
@@ -118,9 +116,10 @@ class Relations(Penalty):
     temperature: float = 0.2
     """Temperature of the softmax over cosines (no unit)."""
 
-    def _loss(
+    def __call__(
         self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
     ) -> Tensor:
+        """Compute the loss in pixels."""
         # Rows are ordered by scene, so an even spacing covers all scenes.
         count = len(student.hidden)
         compared = min(count, self.related_rows)
@@ -155,9 +154,10 @@ class AnchoredReprojection(Penalty):
     teacher_limit_px: float = 10.0
     """Reprojection error below which the teacher's point is used."""
 
-    def _loss(
+    def __call__(
         self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
     ) -> Tensor:
+        """Compute the loss in pixels."""
         cost, _ = fixed_clamp_loss(student.points, rows.target, self.clamp_px)
         _, error = fixed_clamp_loss(teacher.points, rows.target, self.clamp_px)
         distance = _distance_m(student, teacher)
@@ -177,7 +177,8 @@ class Distillation(Penalty):
     scale: float = 1.0
     """Pixels per metre and per nat; the paper's value is 1."""
 
-    def _loss(
+    def __call__(
         self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
     ) -> Tensor:
+        """Compute the loss in pixels."""
         return self.scale * spdd_loss(student, teacher, self.options).total

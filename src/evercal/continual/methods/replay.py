@@ -85,7 +85,7 @@ class ReplayHooks(MemoryHooks):
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
         """Compute the weighted penalty."""
         method = self.method
-        old_output = None
+        old_output = output
         if method.penalty.needs_teacher and self._teacher is not None:
             old_output = teacher_output(self._teacher, rows)
         weight = method.weight
