@@ -244,6 +244,6 @@ def _work(pipe: Connection, begin: Callable[[Any], Callable[[Any], Any]]) -> Non
 
 def _end_with_parent() -> None:
     parent = parent_process()
-    assert parent is not None, "called in a process that multiprocessing started"
+    assert parent, "called in a process that multiprocessing started"
     parent.join()
     os._exit(1)

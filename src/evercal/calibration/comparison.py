@@ -185,7 +185,7 @@ def pooled_scatter(measured: Scatter) -> Array:
 
 def _shared(first: FramedPose, second: FramedPose) -> Strings:
     shared = []
-    if first.camera is not None and first.camera == second.camera:
+    if first.camera and first.camera == second.camera:
         shared.append("intrinsics")
     used = [{use.name for use in one.images if use.used} for one in (first, second)]
     if used[0] & used[1]:

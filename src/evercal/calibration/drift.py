@@ -84,9 +84,9 @@ def check(
     located = locate(localizer, images, camera or reference.camera, on_image)
     if not shows_held_thing(localizer, located, base_from_gripper):
         return shift_between(reference, fuse(located), located, localizer)
-    assert base_from_gripper is not None, "a held thing needs gripper poses"
+    assert base_from_gripper, "a held thing needs gripper poses"
     grip = held_again(located, base_from_gripper)
-    if grip is not None:
+    if grip:
         calibration = grip.solution.calibration()
         covariance = calibration.covariance + reference.covariance
         pose = calibration.parent_from_child

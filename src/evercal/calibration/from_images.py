@@ -103,9 +103,9 @@ def calibrate(
     if own.fits(width, height):
         lenses["stated"] = own.resized(width, height)
     grip = None
-    if view.held and given.base_from_gripper is not None:
+    if view.held and given.base_from_gripper:
         grip = held_again(located, given.base_from_gripper)
-    if grip is not None:
+    if grip:
         camera = lenses["estimated"]
         return _held_thing_calibration(grip, view, camera, source)
     if view.parent_from_scene is None:
@@ -162,7 +162,7 @@ def _view(
             mount = EYE_TO_HAND
     parent_from_scene = None
     in_parent = located
-    if grippers is not None and (held or mount.moves):
+    if grippers and (held or mount.moves):
         parent_from_scene = grippers if held else grippers.inverse()
         in_parent = in_parent_frame(located, parent_from_scene)
     fused = fuse(in_parent)
@@ -174,7 +174,7 @@ def _held_thing_calibration(
     grip: HeldAgain, view: _View, camera: Camera, source: JsonObject
 ) -> Calibration:
     """The calibration that was solved for together with another grip of the thing."""
-    assert view.parent_from_scene is not None, "the gripper holds the scene"
+    assert view.parent_from_scene, "the gripper holds the scene"
     by_lens = in_parent_frame(of_cause(view.located, lens=True), view.parent_from_scene)
     shown = [item for item in by_lens if item.is_located]
     lens = mean_covariance(shown) / len(shown)
@@ -219,7 +219,7 @@ def estimated_camera(used: Sequence[ImagePose], stated: Camera) -> Camera:
     rows = []
     for item in used:
         camera = item.estimate.camera
-        if camera is not None:
+        if camera:
             numbers = [camera.fx, camera.fy, camera.cx, camera.cy]
             rows.append([*numbers, *camera.coefficients])
     if not rows:

@@ -107,7 +107,7 @@ def locate(
             uncertain = UncertainPose(SE3.identity(), np.eye(6))
         else:
             base = contents.base_of(estimate.scene)
-            if own is not None:
+            if own:
                 shape = np.empty((own.height, own.width), np.uint8)
                 scene = contents.scene(estimate.scene)
                 common = cameras_in_scenes(camera, shape, [scene])[0]

@@ -59,7 +59,7 @@ def verdict(calibration: Calibration) -> str:
     mm, deg = expected_error(calibration)
     checks = calibration.checks
     first = f"Unusable: even tabletop tasks ask for {TIERS[-1].mm:g} mm and {TIERS[-1].deg:g} deg."
-    if use is not None:
+    if use:
         first = f"Good for {use.name} (within {use.mm:g} mm and {use.deg:g} deg)."
     first = f"{first} Expected error {_length(mm)} and {deg:.2f} deg"
     if checks.target_m:
@@ -76,7 +76,7 @@ def _advice(use: Tier | None) -> str:
     if use is TIERS[0]:
         return "Check it on the robot before use, with points that it touches: 'evercal verify'."
     wanted = TIERS[-1]
-    if use is not None:
+    if use:
         wanted = TIERS[TIERS.index(use) - 1]
     return (
         f"For {wanted.name}: more poses, tilted more about two axes; let the robot stand still at"

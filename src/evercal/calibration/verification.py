@@ -167,7 +167,7 @@ def _mixture(
 ) -> tuple[Array, dict[str, float]]:
     """Errors (2, m, 6) that are drawn by the data and as stated, and probabilities of causes."""
     units = np.ones(9 + evidence.arm.shape[1])
-    if calibration.camera is not None:
+    if calibration.camera:
         units[7:9] = calibration.camera.width
     kinds = np.repeat([*_CAUSES.values()], [3, 3, 3, len(units) - 9], 1)
     variances = np.kron(kinds * units, _SIZES) ** 2

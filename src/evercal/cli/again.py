@@ -32,7 +32,7 @@ def made_again(file: Path, old: "Calibration") -> str:
 
     made = old.made
     verb: Any = None
-    if made is not None and _MAKERS & {*made.command[1:2]}:
+    if made and _MAKERS & {*made.command[1:2]}:
         verb = parsed([*map(os.path.expanduser, made.command[1:])])
     if made is None or not hasattr(verb, "writes"):
         raise InputError(

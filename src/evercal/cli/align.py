@@ -76,13 +76,13 @@ class Align(args.Verb):
 
         files = image_files(self.images)
         boards = None
-        if self.board_poses is not None:
+        if self.board_poses:
             images = read_board_poses(self.board_poses).detected
             poses = {Path(i.name).name: i.camera_from_board for i in images}
             boards = {}
             for file in files:
                 pose = poses.get(file.name)
-                if pose is not None:
+                if pose:
                     boards[str(file)] = pose
         return cell.align(
             self.scene,

@@ -87,7 +87,7 @@ class Bench(args.Verb):
         from evercal.continual.learning.presets import short_side
         from evercal.continual.strategies import load_plugin
 
-        if self.plugin is not None:
+        if self.plugin:
             load_plugin(self.plugin)
         strategies = self._strategies()  # refused before recordings are read
         scenes = self._recorded()

@@ -165,7 +165,7 @@ def calibration_lines(
         if term.translation_mm >= 0.005 or term.rotation_deg >= 0.0005:
             part = f"{term.translation_mm:.2f} mm, {term.rotation_deg:.3f} deg: {term.name}"
             yield f"    of it      {part} ({100 * share:.0f} % of the position's variance)"
-    if point is not None:
+    if point:
         yield f"  point        {point.text(calibration.uncertain_pose)}"
     yield from held_out_lines(calibration)
     checks = calibration.checks

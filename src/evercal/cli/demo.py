@@ -57,7 +57,7 @@ class Demo(args.Verb):
         from evercal.recordings.samples import ROOMS, copy_samples, sample_rooms
 
         folder = self.copy_samples
-        if folder is not None:
+        if folder:
             copy_samples(folder)
             cell = folder / "cell"
             learn = ("learn", "cell.evercal", cell / "wrist")
@@ -184,8 +184,8 @@ def _fixed_camera(cell: "Map", room: "SampleRoom") -> "FixedCamera":
     name = room.scene.name
     fixed = room.fixed
     bumped = room.bumped
-    assert fixed is not None, "rooms of a demo have a fixed camera"
-    assert bumped is not None, "rooms of a demo have a bumped camera"
+    assert fixed, "rooms of a demo have a fixed camera"
+    assert bumped, "rooms of a demo have a bumped camera"
     true_shift_mm, _ = pose_distance_mm_deg(_pose(fixed), _pose(bumped))
     camera = FixedCamera(name, len(fixed.test), true_shift_mm=true_shift_mm)
     count = len(fixed.test) + len(bumped.test)
@@ -220,7 +220,7 @@ def _images(recording: "Recording") -> "list[np.ndarray]":
 
 def _pose(recording: "Recording") -> "SE3":
     pose = recording.test[0].base_from_camera
-    assert pose is not None, "rendered images have poses"
+    assert pose, "rendered images have poses"
     return pose
 
 

@@ -71,7 +71,7 @@ class Detect(args.Verb):
     """Paper of --make-board: a4, letter, a3, tabloid, a2, a1 or a0."""
 
     def run(self) -> int:
-        if self.make_board is not None:
+        if self.make_board:
             return self._make(self.make_board)
         if not self.images:
             raise InputError(
@@ -98,7 +98,7 @@ class Detect(args.Verb):
         width, height = first_size(files)
         camera = None
         source = "file"
-        if self.camera is not None:
+        if self.camera:
             camera = read_camera_of_size(
                 self.camera, (width, height), "the first image"
             )

@@ -56,7 +56,7 @@ class Inspect(args.Verb):
             record["open_position"] = open and asdict(open)
             if open:
                 lines.append(f"warning: {open.sentence()}")
-        if self.coverage or self.next is not None:
+        if self.coverage or self.next:
             self._advise(recording, record, lines)
         verb = ["learn", "MAP"]
         if recording.arm and "evercal arm-in-view" in str(inspection.warnings):
@@ -79,11 +79,11 @@ class Inspect(args.Verb):
             )
         rough = args.transform_of(self.gripper_from_camera)
         if self.coverage:
-            frames = [f for f in recording.train if f.base_from_gripper is not None]
+            frames = [f for f in recording.train if f.base_from_gripper]
             covered = coverage(list(map(Sample.of, frames)), rough)
             record["coverage"] = asdict(covered)
             lines += _coverage_lines(covered)
-        if self.next is not None:
+        if self.next:
             views = self._next_views(self.next, poses, rough)
             record["next"] = _next_records(views)
             lines += _next_lines(views)

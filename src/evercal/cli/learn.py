@@ -114,7 +114,7 @@ class Learn(args.Verb):
                 f"--workers {self.workers}: give 1 to the number of recordings"
             )
         require_writable(self.calibration, "--calibration")
-        if self.encoder is not None and not self.encoder.is_file():
+        if self.encoder and not self.encoder.is_file():
             raise InputError(f"--encoder {self.encoder}: no such file")
         from evercal.mapping.memory_budget import MemoryBudget
 
@@ -188,7 +188,7 @@ class Learn(args.Verb):
             print("stopped; the same command starts again", file=sys.stderr)
             return 130
         lines = list(summary(report, self.calibration or self.store))
-        if self.calibration is not None:
+        if self.calibration:
             lines.append(f"wrote {self.calibration}")
         then = self._next(recording, report, path)
         self.answer(report.to_dict(), *lines, then=then)
@@ -213,14 +213,14 @@ class Learn(args.Verb):
                 options=MapOptions(errors=self.which.errors()),
                 on_progress=bars.step,
             )
-        if self.calibration is not None:
+        if self.calibration:
             cell.calibration(report.scene).write(self.calibration)
         return report
 
     def _next(
         self, recording: "Recording", report: "LearnReport", path: Path
     ) -> Sequence[object]:
-        if report.hand_eye is not None:
+        if report.hand_eye:
             file = self.calibration or f"{self.store}:{report.scene}"
             return args.next_words(report.hand_eye.calibration, file)
         if not recording.metric:
@@ -320,7 +320,7 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
         yield f"  set aside    {name}: {how}"
     yield from map("warning: {}".format, report.warnings)
     found = report.hand_eye
-    if found is not None:
+    if found:
         pose = found.parent_from_camera
         position = ", ".join(map("{:.1f}".format, 1000 * pose.pose.translation_m))
         quaternion = ", ".join(map("{:.5f}".format, pose.pose.rotation_wxyz))
@@ -338,7 +338,7 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
             far = f"{found.given_mm:.1f} mm and {found.given_deg:.1f} deg"
             yield f"distance from the given one: {far}"
         yield from joint_lines(found.calibration.joints, file)
-    if report.adjusted is not None:
+    if report.adjusted:
         row = adjusted_row(report.scene, dataclasses.asdict(report.adjusted))
         yield "; ".join(map("{} {}".format, row, row.values()))
         if report.adjusted.untracked:

@@ -58,7 +58,7 @@ class Localize(args.Verb):
         files = image_files(self.images)
         camera = args.camera_for(self.camera, files)
         require_folder(self.overlay, "--overlay")
-        if self.video is not None:
+        if self.video:
             from evercal.reports.video import require_ending
 
             require_writable(self.video, "--video")
@@ -72,7 +72,7 @@ class Localize(args.Verb):
             records.append(_record(answer, point))
             lines += _lines(answer, point)
         lines += _summary(answers)
-        if self.video is not None:
+        if self.video:
             self._animate(self.video, localizer, answers)
             lines.append(f"wrote {self.video}")
         located = any(answer.estimate.status == "ok" for answer in answers)
@@ -104,7 +104,7 @@ class Localize(args.Verb):
             estimate = localize_picture(localizer, path, camera)
             milliseconds = 1000 * (time.perf_counter() - began)
             known = unit_known(localizer, estimate.scene)
-            if self.overlay is not None and estimate.scene is not None:
+            if self.overlay and estimate.scene is not None:
                 image = read_image(path)
                 drawn = draw_landmarks(
                     image, estimate, localizer, camera, width=image.shape[1]
@@ -149,10 +149,10 @@ def _overlay_name(files: list[Path], number: int) -> str:
 
 def _record(answer: Answer, point: args.Point | None) -> dict[str, object]:
     record = answer_row(answer)
-    if point is not None:
+    if point:
         pose = finite_pose(answer.estimate)
         record["at"] = None
-        if pose is not None and answer.unit_known:
+        if pose and answer.unit_known:
             record["at"] = point.record(pose)
     return record
 
@@ -191,7 +191,7 @@ def _lines(answer: Answer, point: args.Point | None) -> Iterator[str]:
     if causes:
         yield f"  budget       {', '.join(causes)} of the position's variance"
     uncertain = finite_pose(estimate)
-    if point is not None and uncertain is not None and answer.unit_known:
+    if point and uncertain and answer.unit_known:
         yield f"  point        sd {point.text(uncertain)}"
     yield inliers
 
@@ -210,7 +210,7 @@ def _summary(answers: list[Answer]) -> Iterator[str]:
             refused[estimate.status.replace("_", " ")] += 1
         else:
             scenes[str(estimate.scene)] += 1
-            if pose is not None and answer.unit_known:
+            if pose and answer.unit_known:
                 sigmas.append(pose.sigma_mm)
     line = f"{scenes.total()} of {len(answers)} images located"
     for words, counter in ((", in", scenes), ("; refused:", refused)):

@@ -58,7 +58,7 @@ class Refresh(args.Verb):
             return 0
         with Bars(self.log) as bars:
             recording = _recording(self.images)
-            if recording is not None:
+            if recording:
                 camera = None
                 if recording.train:
                     first = recording.train[0].camera

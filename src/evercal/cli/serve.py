@@ -40,7 +40,7 @@ class Serve(args.Verb):
             raise missing_extra(f"the service needs {error.name}", "serve") from None
 
         token = os.environ.pop(TOKEN, None) or None  # other processes do not inherit it
-        if self.token_file is not None:
+        if self.token_file:
             try:
                 token = self.token_file.read_text(encoding="utf-8").strip()
             except (OSError, ValueError) as error:

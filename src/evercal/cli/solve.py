@@ -127,7 +127,7 @@ def _check_lines(calibration: "Calibration") -> Iterator[str]:
     if checks.scale is not None:
         scale = f"{checks.scale:.6g} +- {checks.scale_sigma:.2g}"
         yield f"  scale        {scale} (size of the board, or metres per unit)"
-    if camera is not None and checks.camera_sigma is not None:
+    if camera and checks.camera_sigma is not None:
         sigma = checks.camera_sigma
         focal = f"fx {camera.fx:.2f}, fy {camera.fy:.2f} +- {sigma['fx']:.2f} px"
         centre = f"cx {camera.cx:.2f}, cy {camera.cy:.2f} +- {sigma['cx']:.2f} px"

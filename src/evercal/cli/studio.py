@@ -105,7 +105,7 @@ class Studio(PageVerb):
                 raise InputError(
                     f"no {missing} given; give both, or --virtual to try it without"
                 )
-        if self.fixed_intrinsics is not None and self.fixed is None:
+        if self.fixed_intrinsics and self.fixed is None:
             raise InputError("--fixed-intrinsics: is of --fixed, which is missing")
 
     def _virtual(self) -> "Devices":
@@ -141,7 +141,7 @@ class Studio(PageVerb):
         from evercal.recordings.streams import is_live
         from evercal.service.studio.devices import Devices
 
-        assert self.poses is not None, "checked before"
+        assert self.poses, "checked before"
         convention = self.pose_convention
         fixed_intrinsics = self.fixed_intrinsics
         wrist = None if self.camera is None else open_camera(self.camera)
@@ -158,7 +158,7 @@ class Studio(PageVerb):
                 "no --intrinsics FILE given: a new recording needs the intrinsics"
             )
         reachable = None
-        if self.reachable is not None:
+        if self.reachable:
             poses = read_robot_poses(
                 self.reachable, convention, option="--pose-convention"
             )

@@ -69,7 +69,7 @@ class Track(args.Verb):
         )
         tracker: Tracker | None = None
         publisher = None
-        if self.publish is not None:
+        if self.publish:
             from evercal.live.ros2.publishing import PosePublisher
 
             publisher = PosePublisher(*self.publish, static=False)
@@ -146,7 +146,7 @@ def _line(name: str, frame: "TrackedFrame", unit_known: bool) -> str:
     position = estimate.base_from_camera.translation_m
     pose = estimate.uncertain_pose
     where = f"{numbers(position, '+.4g')} in an unknown unit"
-    if unit_known and pose is not None:
+    if unit_known and pose:
         where = f"{numbers(1e3 * position, '+.1f')} +- {pose.sigma_mm:.1f} mm"
     line = f"{name}: {frame.state}, {estimate.scene}, {where}"
     line += f", {estimate.milliseconds:.0f} ms"

@@ -86,7 +86,7 @@ class Verify(args.Verb):
         calibration = calibration_at(self.calibration)
         camera = calibration.camera
         lines = []
-        if self.picks is not None:
+        if self.picks:
             if self.pick:
                 self._pick(self._touches(), self.picks)
             picks, grippers = self._picked(calibration, self.picks)
@@ -96,7 +96,7 @@ class Verify(args.Verb):
             target, grippers = self._target(calibration)
             pose = args.transform_of(self.target_pose)
             data = target_data(calibration, target, grippers, pose)
-            if self.depth is not None and camera is not None:
+            if self.depth and camera:
                 lines.append(_DEPTH.format(depth_fit(self.depth, camera, target)))
         errors = None
         if self.which != args.ArmGiven():
@@ -127,7 +127,7 @@ class Verify(args.Verb):
         from evercal.recordings.poses.robot_poses import read_robot_poses
 
         sigma_m = self.touch_mm / 1000
-        if self.points is not None:
+        if self.points:
             return touched_tips(read_points(self.points), sigma_m)
         if self.touches is None:
             raise InputError("--picks: give --points or --touches of these points")
@@ -166,7 +166,7 @@ class Verify(args.Verb):
         picks = read_picks(file)
         images = {pick.image: file.parent / pick.image for pick in picks}
         _require_size(calibration, first_size([*images.values()]))
-        if self.depth is not None and calibration.camera is not None:
+        if self.depth and calibration.camera:
             for i, pick in enumerate(picks):
                 depth = read_depth(self.depth, pick.image, calibration.camera)
                 picks[i] = pick._replace(depth_m=depth_at(depth, pick.pixel))
@@ -179,7 +179,7 @@ class Verify(args.Verb):
         from evercal.calibration.unseen.targets import board_target, scene_target
         from evercal.recordings.image_files import image_files
 
-        if self.board_poses is not None:
+        if self.board_poses:
             boards = read_board_poses(self.board_poses)
             _require_size(calibration, boards.camera.size)
             target = board_target(boards)
@@ -199,7 +199,7 @@ class Verify(args.Verb):
 
 def _require_size(calibration: "Calibration", size: tuple[int, int]) -> None:
     camera = calibration.camera
-    if camera is not None and camera.size != size:
+    if camera and camera.size != size:
         raise InputError(
             f"the images are {size[0]}x{size[1]}, those of the calibration"
             f" {camera.width}x{camera.height}; give images and calibration of one camera"

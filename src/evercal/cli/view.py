@@ -51,7 +51,7 @@ class View(PageVerb):
     """Robot description of the arm; its base link is at the robot base."""
 
     def run(self) -> int:
-        if self.camera is not None and self.live is None:
+        if self.camera and self.live is None:
             raise InputError("--camera: is that of --live, which is missing")
         self.prepare()
         from evercal.service.viewer.page import Page

@@ -101,7 +101,7 @@ class NetworkLocalizer:
     def _candidates(
         self, encoded: Encoded, cameras: Sequence[Camera | None]
     ) -> list[int]:
-        usable = [i for i, camera in enumerate(cameras) if camera is not None]
+        usable = [i for i, camera in enumerate(cameras) if camera]
         if self._decides_scene:
             return usable[:1]
         _, descriptor = described(encoded.features, self.contents.descriptor)
@@ -121,7 +121,7 @@ class NetworkLocalizer:
         moved: bool = False,
     ) -> Rough | None:
         camera = cameras[scene]
-        assert camera is not None, "only scenes whose camera fits are tried"
+        assert camera, "only scenes whose camera fits are tried"
         small = camera.short_side_resized(self.contents.short_side)
         matches, patches = self._predicted(encoded, scene, small)
         rough = solve_pnp(matches.pixels, matches.points_m, small, self.options.pnp)

@@ -48,7 +48,7 @@ class Strategy:
     def description(self) -> JsonObject:
         """Convert to plain data: method with hyper-parameters, map, joint training."""
         record: JsonObject = {"method": None, "map": self.method is None}
-        if self.method is not None:
+        if self.method:
             record["method"] = described(self.method)
         if self.jointly:
             record["jointly"] = True

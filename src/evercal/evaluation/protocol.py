@@ -132,11 +132,11 @@ def _result(localizer: SceneLocalizer, test: _Test) -> FrameResult:
     truth = frame.base_from_camera
     pose = estimate.base_from_camera
     if estimate.status == "ok" and estimate.scene in test.accepted:
-        assert truth is not None
-        assert pose is not None, "an estimate whose status is ok has a pose"
+        assert truth
+        assert pose, "an estimate whose status is ok has a pose"
         metres, radians = pose_distance(truth, pose)
         uncertain = estimate.uncertain_pose
-        if uncertain is not None:
+        if uncertain:
             squared = uncertain.squared_mahalanobis(truth)
     return FrameResult(
         scene=test.scene,

@@ -226,7 +226,7 @@ def load_encoder(
         raise InputError(
             f"encoder {source!r}: give an ONNX file or a function on arrays"
         )
-    if stored is not None and stored.suffix == ".json":
+    if stored and stored.suffix == ".json":
         record = json.loads(stored.read_bytes())
         encoder.require_same(record, stored)
     return encoder

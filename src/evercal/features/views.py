@@ -137,7 +137,7 @@ def augmented_view(
     inside = (source >= 0) & (source <= [width - 1, height - 1])
     plane = ray[:, :2] / ray[:, 2:]
     pixels = _on_image(plane, camera)
-    assert frame.base_from_camera is not None, "augmented frames have poses"
+    assert frame.base_from_camera, "augmented frames have poses"
     return View(
         grey=np.asarray(warped, np.uint8),
         cell_pixels=pixels.astype(np.float32),

@@ -49,7 +49,7 @@ def fewest_keyframes(
     candidates = [others[i] for i in spread]
     located = located_poses(localizer, candidates)
     for frame, pose in zip(candidates, located, strict=True):
-        if pose is not None:
+        if pose:
             probes.append(frame)
             references.append(pose)
     unit = built.scene.frame.scale

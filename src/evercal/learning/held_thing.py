@@ -136,6 +136,6 @@ def _to_locate(frames: Sequence[Frame], built: BuiltMap) -> list[Frame]:
     """Frames to locate in the finished map: those that are no keyframes, if there are any."""
     others = [frame for frame in frames if frame.name not in built.keyframe_names]
     others = others or list(frames)
-    if built.hand_eye is not None and built.hand_eye.arm is not None:
+    if built.hand_eye and built.hand_eye.arm:
         return with_offsets(others, built.hand_eye.arm)
     return others

@@ -130,7 +130,7 @@ def _relation(
     pairs = []
     for view in _views(scene):
         pose = localizer.localize(*view.image).uncertain_pose
-        if pose is not None:
+        if pose:
             pairs.append((view.base_from_camera, pose))
     if not pairs:
         return None

@@ -79,7 +79,7 @@ class LearnReport:
         from evercal.learning.stated_warnings import stated_warnings
 
         warnings = []
-        if self.adjusted is not None:
+        if self.adjusted:
             warnings += stated_warnings(self.adjusted, self.hand_eye is None)
         for other in self.same_place:
             if not other.same_base:

@@ -58,7 +58,7 @@ def located_as_stated(localizer: Localizer, frames: Sequence[Frame]) -> Strings:
     names = []
     for frame in frames:
         estimate, pose = localizer.located(frame.read_image(), frame.camera)
-        assert frame.base_from_camera is not None, "a posed frame"
+        assert frame.base_from_camera, "a posed frame"
         stated = scene.frame.from_base(frame.base_from_camera)
         if estimate.status != "ok" or pose is None or differ(pose, stated):
             continue
@@ -125,7 +125,7 @@ def held_out_errors(
     errors: dict[str, Floats] = {frame.name: () for frame in held_out}
     for frame, aligned in _aligned(contents, scene, [part], CERTAINLY_OWN):
         stated = frame.base_from_camera
-        if stated is not None:
+        if stated:
             estimate, _ = in_base(aligned, scene)
             errors[frame.name] = pose_distance_mm_deg(estimate.pose, stated)
     return errors
@@ -148,7 +148,7 @@ def _aligned(
             start = scene.frame.from_base(frame.base_from_camera)
             query = localizer.query(as_rgb(frame.read_image()), frame.camera)
             aligned = few.aligned(query, index, start, prior)
-            if aligned is not None:
+            if aligned:
                 yield frame, aligned
 
 
@@ -164,7 +164,7 @@ class _Answer(NamedTuple):
 
 def _answer(frame: Frame, aligned: Aligned, scene: SceneMap) -> _Answer:
     stated = frame.base_from_camera
-    assert stated is not None, "only posed frames are aligned"
+    assert stated, "only posed frames are aligned"
     estimate, _ = in_base(aligned, scene)
     rotation = (estimate.pose.inverse() @ stated).log()[3:]
     shift = stated.translation_m - estimate.pose.translation_m

@@ -102,7 +102,7 @@ class StreamCamera:
             self._changed.wait_for(lambda: self._ended or arrived(), self._timeout_s)
             if arrived():
                 return self._frame
-        if self._error is not None:
+        if self._error:
             raise self._error
         return None
 

@@ -45,7 +45,7 @@ class Sample:
     @classmethod
     def of(cls, frame: Frame) -> Self:
         """Measure a frame with a gripper pose."""
-        assert frame.base_from_gripper is not None, "coverage is of gripper poses"
+        assert frame.base_from_gripper, "coverage is of gripper poses"
         image = frame.read_image()
         return cls(
             name=frame.name,
@@ -112,7 +112,7 @@ def coverage(
     good = [i for i, row in enumerate(rows) if not row.problems]
     poses = poses[good]
     mover = "gripper"
-    if gripper_from_camera is not None:
+    if gripper_from_camera:
         poses = poses @ gripper_from_camera
         mover = "camera"
     rotation_spreads, principal_spreads = _rotation_spreads_deg(poses)

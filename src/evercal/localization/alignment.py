@@ -270,7 +270,7 @@ class _Search:
         options = self.options
         level = step.level
         most = step.landmarks
-        if before is not None:
+        if before:
             share = len(before.pixels) / before.expected
             more = max(1.0, options.enough_matched / max(share, 1e-3))
             most = int(min(more, options.most_more) * step.landmarks)

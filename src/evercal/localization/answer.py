@@ -46,7 +46,7 @@ def in_base(
     factor = widening(hypothesis)
     pose = hypothesis.pose
     covariance = factor * pose.covariance
-    if misfit is not None:
+    if misfit:
         covariance = covariance + misfit.covariance
     wide = UncertainPose(pose.pose, covariance)
     estimate = frame.to_base(wide)
@@ -105,7 +105,7 @@ def answer(
     misfit = _misfit(best)
     estimate, terms = in_base(best, scene, misfit)
     rejected = replace(rejected, parent_frame=scene.parent_frame, base=scene.base)
-    if rival is not None:
+    if rival:
         return replace(
             rejected,
             status="ambiguous",
@@ -177,12 +177,12 @@ def _useless(
                 f"it needs a principal point at ({camera.cx:.0f}, {camera.cy:.0f}) of"
                 f" {camera.width}x{camera.height} px: give the whole image as the camera took it"
             )
-    if misfit is not None and misfit.size * math.sqrt(widening(best)) > WARPED:
+    if misfit and misfit.size * math.sqrt(widening(best)) > WARPED:
         return misfit.reason
     if scene.at_room_scale(position) <= acceptance.USELESS_M:
         return ""
     reason = _uncertain_reason(position, scene)
-    if misfit is not None:
+    if misfit:
         return f"{reason}: {misfit.reason}"
     return reason
 

@@ -107,7 +107,7 @@ class PoseEstimate:
     def _in_words(self) -> dict[str, str]:
         words = {"status": self.status, "scene": self.scene or "none"}
         pose = self.uncertain_pose
-        if pose is not None:
+        if pose:
             x, y, z = pose.pose.translation_m
             position = f"({x:.4f}, {y:.4f}, {z:.4f})"
             words["position"] = f"{position} in {self.parent_frame}"

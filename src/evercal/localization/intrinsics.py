@@ -194,7 +194,7 @@ def cameras_in_scenes(
     The recording's intrinsics are replaced by the adjusted ones.
     """
     height, width = image.shape[:2]
-    if camera is not None and not camera.fits(width, height):
+    if camera and not camera.fits(width, height):
         raise InputError(
             f"camera {camera.width}x{camera.height} does not fit the image {width}x{height}:"
             " give intrinsics of the same aspect ratio"
@@ -231,7 +231,7 @@ def prior_of(
 def _stated_prior(
     camera: Camera | None, image: Image, scene: RecordedScene
 ) -> IntrinsicsPrior:
-    if camera is not None:
+    if camera:
         if _is_own(camera, scene):
             return OWN
         return STATED

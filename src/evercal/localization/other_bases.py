@@ -65,7 +65,7 @@ def in_other_base(
     for number in others:
         scene = scenes[number]
         between = base_from_other_base(scene, own.scene)
-        if between is not None and not same_base(scene, own.scene):
+        if between and not same_base(scene, own.scene):
             views.append(_in_base(poses, query, number, between @ own.pose))
     likeliest = max(views, key=lambda view: view.inlier_ratio)
     for view in views:

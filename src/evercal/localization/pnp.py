@@ -125,7 +125,7 @@ def most_inliers(
     most = 0
     for number, camera in enumerate(cameras):
         result = solve_pnp(pixels, points_m, camera, options)
-        if result is not None and result.inlier_count > most:
+        if result and result.inlier_count > most:
             best = result
             index = number
             most = result.inlier_count

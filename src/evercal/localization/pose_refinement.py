@@ -160,7 +160,7 @@ def minimise(
         residual, slope = whitened(observed.whitening, raw, slope)
         squares = residual[0] * residual[0] + residual[1] * residual[1]
         variance = robust_variance(squares)
-        if best is not None and variance > _DIVERGED * best.variance:
+        if best and variance > _DIVERGED * best.variance:
             return _with_camera(best)
         root = 1 / np.sqrt(1 + squares / variance)
         rows = (slope * root).reshape(len(slope), -1)
@@ -187,7 +187,7 @@ def minimise(
         gradient = gradient + data @ step
         if step @ data @ step + prior @ step[6:] ** 2 < _CONVERGED * variance:
             break
-    assert best is not None, "at least one iteration"
+    assert best, "at least one iteration"
     ahead = replace(
         best, rotation=rotation, position=position, change=moved, gradient=gradient
     )

@@ -215,7 +215,7 @@ def _verified(after: Localizer, images: Sequence[NewImage], scene: str) -> _Shif
     for image in images:
         estimate = after.localize(image.frame.read_image(), image.camera)
         pose = estimate.base_from_camera
-        if estimate.status == "ok" and estimate.scene == scene and pose is not None:
+        if estimate.status == "ok" and estimate.scene == scene and pose:
             moves.append(pose @ image.base_from_camera.inverse())
     lost = len(images) - len(moves)
     if not moves or lost > max(1, WORSE * len(images)):

@@ -112,7 +112,7 @@ def _rivals(poses: ScenePoses, query: Query, best: Aligned) -> Iterator[Aligned]
     for step in poses.slips(best):
         start = displaced(pose, step)
         rival = poses.aligned(query, best.candidate, start, best.change, coarse=False)
-        if rival is not None:
+        if rival:
             yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)
 
 
@@ -136,5 +136,5 @@ def _other_focal_lengths(
         return
     change = zoomed(factors[index])
     rival = poses.aligned(query, best.candidate, pnp.pose, change)
-    if rival is not None:
+    if rival:
         yield replace(rival, matches=best.matches, pnp_inliers=best.pnp_inliers)

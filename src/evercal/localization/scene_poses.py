@@ -86,9 +86,7 @@ class ScenePoses:
             options = replace(options, max_iterations=half)
             cameras = [camera.zoomed(factor) for factor in FOCAL_FACTORS]
             index, other = most_inliers(*matches, cameras, options)
-            if best is None or (
-                other is not None and other.inlier_count > best.inlier_count
-            ):
+            if best is None or (other and other.inlier_count > best.inlier_count):
                 best = other
                 factor = FOCAL_FACTORS[index]
         if best is None:

@@ -174,10 +174,10 @@ class Tracker:
     def _located(self, image: Image, stamp: float) -> tuple[PoseEstimate, TrackState]:
         tracked = self._near_prediction(image, stamp)
         self._unchecked += 1
-        if tracked is not None and self._unchecked < self.options.checked:
+        if tracked and self._unchecked < self.options.checked:
             return tracked, "tracking"
         located = self.localizer.located(image, self.camera)
-        if tracked is not None and self._confirmed(tracked, located[0]):
+        if tracked and self._confirmed(tracked, located[0]):
             return tracked, "tracking"
         return self._relocalized(image, stamp, located)
 
@@ -198,7 +198,7 @@ class Tracker:
         """Whether the location of a frame from nothing does not contradict its tracked pose."""
         pose = tracked.uncertain_pose
         other = alone.uncertain_pose
-        if pose is not None and other is not None:
+        if pose and other:
             squares = pose.squared_mahalanobis(other.pose)
             if tracked.scene != alone.scene or squares > APART_SIGMAS**2:
                 return False
@@ -220,14 +220,14 @@ class Tracker:
             self._pool = self._pool or ThreadPoolExecutor(1, "search")
             future = self._pool.submit(self.localizer.located, image, self.camera)
             self._running = _Running(image, stamp, tracked, future)
-        if tracked is not None:
+        if tracked:
             if adopted:
                 return tracked, "relocalized"
             return tracked, "tracking"
         self._poses.clear()
         if started:
             finished = self._finished(until - _ANSWER_S)
-            if finished is not None:
+            if finished:
                 return self._relocalized(image, stamp, finished.future.result())
         spent = 1000 * (time.perf_counter() - began)
         searching = PoseEstimate.failed(_SEARCHING, spent)
@@ -250,7 +250,7 @@ class Tracker:
             return False
         located = finished.future.result()
         tracked = finished.tracked
-        if tracked is not None and self._poses and self._confirmed(tracked, located[0]):
+        if tracked and self._poses and self._confirmed(tracked, located[0]):
             return False
         _, state = self._relocalized(finished.image, finished.stamp, located)
         return state == "relocalized"

@@ -37,7 +37,7 @@ def with_offsets(frames: Sequence[Frame], offsets: ArmOffsets) -> list[Frame]:
         if offsets.mount.moves:
             change = after @ before.inverse()
         camera = frame.base_from_camera
-        if camera is not None:
+        if camera:
             camera = change @ camera
         changed.append(replace(frame, base_from_gripper=after, base_from_camera=camera))
     return changed

@@ -233,12 +233,12 @@ def _adjust(
     adjustment = None
     kinds = None
     # Stated joint values show their offsets better than poses.
-    if options.mount is not None and arm is None:
+    if options.mount and arm is None:
         kinds = shared_errors(stated_grippers(prepared.frames), options.errors)
     for number in range(options.rounds):
         on_progress("adjusting", number, options.rounds)
         tracks = bundle_tracks(prepared, keyframes)
-        if arm is not None:
+        if arm:
             joints = joint_slopes(prepared.frames, arm)
         problem = BundleAdjustment(
             prepared.stated,
@@ -253,7 +253,7 @@ def _adjust(
         )
         adjustment = problem.solve(tracks)
         prepared.adjust(adjustment.poses, adjustment.cameras)
-        if arm is not None:
+        if arm:
             arm = _offsets(arm, adjustment)
             prepared.frames = tuple(with_offsets(prepared.frames, arm))
         if not _moved(prepared.stated, stated_cameras[0], adjustment):
@@ -262,7 +262,7 @@ def _adjust(
         with ThreadPoolExecutor(cores()) as pool:
             list(pool.map(again, keyframes))
     on_progress("adjusting", options.rounds, options.rounds)
-    assert adjustment is not None, "at least one round"
+    assert adjustment, "at least one round"
     return adjustment
 
 
@@ -310,7 +310,7 @@ def _finish(
     adjusted = Adjusted()
     frame = MapFrame()
     hand_eye = None
-    if adjustment is not None:
+    if adjustment:
         doubtful = np.flatnonzero(adjustment.weight < DOUBTFUL_WEIGHT)
         frame = _map_frame(adjustment, numbers, options)
         adjusted = replace(
@@ -371,12 +371,12 @@ def _hand_eye(
     options: MapOptions,
 ) -> HandEyeCorrection:
     scale = 1.0
-    if options.mount is not None and options.mount.moves:
+    if options.mount and options.mount.moves:
         scale = HAND_EYE_COVARIANCE_SCALE
     camera = frames.cameras[0]
     by_cause = of_rays(adjustment, camera, options.whole or camera, scale)
     arm = None
-    if options.arm is not None and len(adjustment.offsets):
+    if options.arm and len(adjustment.offsets):
         arm = _offsets(options.arm, adjustment)
     names = frames.names(np.arange(len(frames)))
     return HandEyeCorrection(

@@ -195,12 +195,12 @@ class BuiltMap:
         """Other frames of the recording, with the adjusted `gripper_from_camera`."""
         if self.hand_eye is None:
             return list(frames)
-        if self.hand_eye.arm is not None:
+        if self.hand_eye.arm:
             frames = with_offsets(frames, self.hand_eye.arm)
         change = self.hand_eye.start_camera_from_camera
         corrected = []
         for frame in frames:
-            if frame.base_from_camera is not None:
+            if frame.base_from_camera:
                 pose = frame.base_from_camera @ change
                 corrected.append(replace(frame, base_from_camera=pose))
         return corrected
@@ -219,7 +219,7 @@ class BuiltMap:
         The frames are all that the map was built from, in recorded order. A recording that is too
         short for it, or that states gripper poses, gives none.
         """
-        if len(frames) < 3 * GAP or self.hand_eye is not None:
+        if len(frames) < 3 * GAP or self.hand_eye:
             return []
         order = {frame.name: i for i, frame in enumerate(frames)}
         recorded = np.array([order[name] for name in self.keyframe_names])

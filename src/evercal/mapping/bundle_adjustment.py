@@ -205,12 +205,12 @@ class BundleAdjustment:
         damping = estimate.damping
         root = None
         # The damping of a step does not make its parameters more certain.
-        if undamped is not None:
+        if undamped:
             root = undamped.root
         for _ in range(MAX_RAISES + 1):
             if damping:
                 solution = normal.solve(damping)
-            if solution is not None:
+            if solution:
                 if root is None:
                     root = solution.root
                 moved = self._moved(tracks, estimate, solution, root)

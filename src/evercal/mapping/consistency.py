@@ -133,7 +133,7 @@ def _require_frame(frame: MapFrame) -> None:
             "base_covariance is a covariance (6, 6)",
         )
     correction = frame.correction
-    if correction is not None:
+    if correction:
         shape = (len(correction.poses), 6)
         _require(correction.correction.shape == shape, f"correction is {shape}")
         _require_small("correction", correction.correction, correction.radius)

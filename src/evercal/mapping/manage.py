@@ -330,7 +330,7 @@ def _commit(
         item: _Incoming,
         folder: Path,
     ) -> None:
-        if networks is not None:
+        if networks:
             store.networks = tuple(networks.payload["networks"])
             for network in store.networks:
                 _copy(source, network, networks, store.root / network)

@@ -105,7 +105,7 @@ class MapFrame:
         variance = np.square(self.pose_sigma) + np.square(self.frame_sigma)
         covariance = map_from_camera.covariance + np.diag(np.repeat(variance, 3))
         pose = self._undo(map_from_camera.pose)
-        if self.similarity is not None:
+        if self.similarity:
             pose = self.similarity.pose(pose)
             covariance = self.slope @ covariance @ self.slope.T
         estimate = UncertainPose(pose, covariance)
@@ -129,7 +129,7 @@ class MapFrame:
     def slope(self) -> Array:
         """(6, 6) derivative of an answer by a pose among the landmarks."""
         slope = np.eye(6)
-        if self.similarity is not None:
+        if self.similarity:
             rotation = self.similarity.base_from_map.rotation_matrix()
             slope[:3, :3] = self.similarity.scale * rotation
         return slope
@@ -137,10 +137,10 @@ class MapFrame:
     def from_base(self, base_from_camera: SE3) -> SE3:
         """Camera pose among the landmarks: the inverse of `to_base`."""
         stated = base_from_camera
-        if self.similarity is not None:
+        if self.similarity:
             stated = self.similarity.inverse_pose(base_from_camera)
         pose = stated @ self.common
-        if self.correction is not None:
+        if self.correction:
             # The correction depends on the pose that is sought, and varies little over its size.
             for _ in range(3):
                 correction = self.correction.at(pose @ self.common.inverse())
@@ -215,7 +215,7 @@ def shared_sigma(
     if len(correction) < 4:
         return 0.0, 0.0
     left = correction
-    if fitted is not None:
+    if fitted:
         left = correction - _left_out(poses, correction, fitted.radius)
     metres = _shared(correction[:, :3], left[:, :3])
     radians = _shared(correction[:, 3:], left[:, 3:])
@@ -261,7 +261,7 @@ def frame_to_dict(frame: MapFrame) -> JsonObject:
     """A map's frame as JSON values, without its slowly varying corrections."""
     base = None
     similarity = frame.similarity
-    if similarity is not None:
+    if similarity:
         base = similarity.base_from_map
     covariance = frame.base_covariance
     return {

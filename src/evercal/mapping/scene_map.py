@@ -82,7 +82,7 @@ class SceneMap:
         digest = hashlib.sha256(b"".join(self.keyframes.images))
         digest.update(self.keyframes.base_from_camera.matrix().tobytes())
         similarity = self.frame.similarity
-        if similarity is not None:
+        if similarity:
             digest.update(similarity.base_from_map.matrix().tobytes())
             digest.update(np.float64(similarity.scale).tobytes())
         return digest.hexdigest()[:16]

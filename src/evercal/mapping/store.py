@@ -278,7 +278,7 @@ def write_scene(folder: Path, scene: SceneMap) -> None:
     write_json(folder / SCENE, content)
     # That of the scene that is replaced.
     (folder / CORRECTION).unlink(missing_ok=True)
-    if scene.frame.correction is not None:
+    if scene.frame.correction:
         save_tensors(folder / CORRECTION, correction_tensors(scene.frame.correction))
 
 

@@ -234,7 +234,7 @@ def refine_depths(
         which = np.flatnonzero(count >= MIN_VIEWS - 1)
         for _ in range(updates):
             _update_depths(recording, keyframe, observations)
-    assert observations is not None, "there is at least one round"
+    assert observations, "there is at least one round"
     _confirm(recording, keyframe, observations)
 
 

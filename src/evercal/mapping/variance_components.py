@@ -149,7 +149,7 @@ def shared_variances(
             options,
         )
     alike = []
-    if options.lens_sigma is not None:
+    if options.lens_sigma:
         alike.append((slice(-INTRINSICS, None), USUAL_LENS, MOST_LENS))
     if joints.stop > joints.start:
         alike.append((joints, USUAL_OFFSET, 1.0))

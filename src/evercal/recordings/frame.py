@@ -58,21 +58,17 @@ class Frame:
 
 def posed_frames(frames: Iterable[Frame]) -> tuple[Frame, ...]:
     """Frames with a camera pose."""
-    return tuple(frame for frame in frames if frame.base_from_camera is not None)
+    return tuple(frame for frame in frames if frame.base_from_camera)
 
 
 def stated_poses(frames: Iterable[Frame]) -> SE3:
     """(n,) base_from_camera of the frames that have one."""
-    return SE3.stack(
-        [f.base_from_camera for f in frames if f.base_from_camera is not None]
-    )
+    return SE3.stack([f.base_from_camera for f in frames if f.base_from_camera])
 
 
 def stated_grippers(frames: Iterable[Frame]) -> SE3:
     """(n,) base_from_gripper of the frames that have one."""
-    return SE3.stack(
-        [f.base_from_gripper for f in frames if f.base_from_gripper is not None]
-    )
+    return SE3.stack([f.base_from_gripper for f in frames if f.base_from_gripper])
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +113,7 @@ def with_images(recording: Recording, folder: Path) -> Recording:
     lost = {}
     for frame in (*recording.train, *recording.test):
         file = file_of(frame.image)
-        if file is not None:
+        if file:
             files[frame.name] = file
             if not is_readable(file):
                 lost[frame.name] = file

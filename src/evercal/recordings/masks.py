@@ -74,7 +74,7 @@ def with_masks(recording: Recording, root: Path) -> Recording:
 
 def _masked(frame: Frame, folder: Path) -> Frame:
     file = file_of(frame.image)
-    if file is not None:
+    if file:
         for name in (file.stem, file.name):
             mask = folder / f"{name}.png"
             if mask.is_file():

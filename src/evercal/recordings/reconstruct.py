@@ -150,7 +150,7 @@ def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFram
         )
         small = np.asarray(resized, np.uint8)
         moved = _motion(last, small)
-        if best is not None and moved > 1.5 * motion:
+        if best and moved > 1.5 * motion:
             yield best[1]
             last = best[2]
             best = None
@@ -159,7 +159,7 @@ def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFram
             sharp = float(cv2.Laplacian(small, cv2.CV_64F).var())
             if best is None or sharp > best[0]:
                 best = (sharp, frame, small)
-    if best is not None:
+    if best:
         yield best[1]
 
 

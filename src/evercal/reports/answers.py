@@ -42,7 +42,7 @@ def answer_row(answer: Answer) -> JsonObject:
     estimate = answer.estimate
     pose = pose_to_dict(estimate.base_from_camera)
     uncertain = finite_pose(estimate)
-    if pose is not None and estimate.base_from_camera is not None:
+    if pose is not None and estimate.base_from_camera:
         pose["matrix"] = estimate.base_from_camera.matrix().tolist()
     terms = []
     for term, share in budget_of(estimate):
@@ -53,7 +53,7 @@ def answer_row(answer: Answer) -> JsonObject:
     if pose is not None or estimate.alternatives:
         unit = "metres" if answer.unit_known else "unknown"
     covariance = None
-    if uncertain is not None:
+    if uncertain:
         covariance = uncertain.covariance.tolist()
     return {
         "path": str(answer.path),

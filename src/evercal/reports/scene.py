@@ -213,7 +213,7 @@ def keyframe_views(scene: SceneMap) -> list[KeyframeView]:
     for i, camera in enumerate(keyframes.cameras):
         pose = keyframes.base_from_camera[i]
         marks = keyframes.landmarks[i]
-        if scene.frame.similarity is not None:
+        if scene.frame.similarity:
             pose = scene.frame.similarity.pose(pose)
         image = np.repeat(keyframes.grey(i)[..., None], 3, axis=-1)
         frustum = Frustum.of(pose, camera)
@@ -347,7 +347,7 @@ def view_panel(
     ends = 0.08 * extent * np.insert(directions, 0, 0, axis=1)
     for line, ink in zip(ends, ("red", "green", "blue"), strict=True):
         drawn.append(Shape("line", line[:, plane], ink, 2.5))
-    if view is not None:
+    if view:
         outline = _edges(view, 0.08 * extent)
         drawn.append(Shape("line", outline[:, plane], "orange", 2.2))
     labels = (axes.label(plane[0]), axes.label(plane[1]))

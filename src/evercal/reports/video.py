@@ -130,9 +130,9 @@ def _from_above(
             continue
         if not answer.unit_known:
             unit = "unit unknown"
-        if pose is not None:
+        if pose:
             eyes[i] = pose.translation_m
-        if pose is not None and i == number:
+        if pose and i == number:
             view = Frustum.of(pose, scene.adjusted_camera)
     located = np.isfinite(eyes[:, 0])
     points = np.concatenate([np.zeros((1, 3)), eyes[located]])
@@ -155,6 +155,6 @@ def _words(answer: Answer) -> str:
         estimate.status.replace("_", " "),
         f"{estimate.inliers} inliers",
     ]
-    if estimate.status == "ok" and pose is not None and answer.unit_known:
+    if estimate.status == "ok" and pose and answer.unit_known:
         words.append(f"sigma {pose.sigma_mm:.2f} mm, {pose.sigma_deg:.3f} deg per axis")
     return "    ".join(words)

@@ -122,7 +122,7 @@ def shared_errors(base_from_gripper: SE3, errors: ArmErrors) -> dict[str, Shared
 
     usual = joint_slopes(base_from_gripper, None)
     slopes = usual
-    if errors.arm is not None:
+    if errors.arm:
         slopes = joint_slopes(base_from_gripper, errors.arm)
     joints = _main_effects(slopes)
     accuracy_rad = errors.offset_rad(slopes)

@@ -41,7 +41,7 @@ class _Patient:
 
     def resume_writing(self) -> None:
         super().resume_writing()  # pyright: ignore[reportAttributeAccessIssue]
-        if self.unread is not None:
+        if self.unread:
             self.unread.cancel()
 
 
@@ -119,7 +119,7 @@ class _Connection(_Patient, H11Protocol):
         self.latest = self.loop.call_later(self.bounds.wait_s, self._late)
 
     def _stop_waiting(self) -> None:
-        if self.latest is not None:
+        if self.latest:
             self.latest.cancel()
 
     def _late(self) -> None:

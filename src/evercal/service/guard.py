@@ -147,7 +147,7 @@ class Guard:
         if scope["type"] == "websocket":
             return await self._stream(refusal, scope, receive, send)
         app = self._app
-        if refusal is not None:
+        if refusal:
             app = _refused(*refusal)
         began = time.perf_counter()
         status = 0
@@ -190,7 +190,7 @@ class Guard:
     ) -> None:
         if refusal is None and self._streams >= self._limits.streams:
             refusal = 429, "too many streams"
-        if refusal is not None:  # the handshake gets status 403
+        if refusal:  # the handshake gets status 403
             return await send(
                 {"type": "websocket.close", "code": 1008, "reason": refusal[1]}
             )

@@ -211,7 +211,7 @@ async def _decode(
         sent.before_image = check
         sent.check_pixels()
         poses = None
-        if robot_poses is not None and table is not None:
+        if robot_poses and table is not None:
             ending = Path(robot_poses.filename or "").suffix
             poses = poses_of(table, ending, sent.names, convention or None)
         return Images(sent, sent.camera(intrinsics), poses)

@@ -230,7 +230,7 @@ class StageStore(Generic[Contents]):
             # A folder that the manifest does not list keeps its name.
             number = made
             for match in map(_STAGE.fullmatch, _names(self.root / STAGES)):
-                if match is not None:
+                if match:
                     number = max(number, int(match[1]))
             new = {}
             for name, write in added:

@@ -178,7 +178,7 @@ def _image_to_dict(image: BoardImage) -> JsonObject:
     }
     if image.covariance is not None:
         record["covariance"] = image.covariance.tolist()
-    if image.view is not None:
+    if image.view:
         record["points_m"] = image.view.points_m.tolist()
         record["pixels"] = image.view.pixels.tolist()
     return record

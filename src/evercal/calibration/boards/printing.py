@@ -179,7 +179,7 @@ def _sheet(
         return None
 
     sheet = fitting(paper)
-    if sheet is not None:
+    if sheet:
         return sheet
     remedy = "make the squares smaller"
     for larger in reversed(PAPERS_MM):

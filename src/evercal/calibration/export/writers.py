@@ -223,7 +223,7 @@ def opencv(export: Export) -> str:
     storage.write("rvec", rotation.as_rotvec().reshape(3, 1))
     storage.write("tvec", camera_from_parent.translation_m.reshape(3, 1))
     camera = export.calibration.camera
-    if camera is not None:
+    if camera:
         storage.write("image_width", camera.width)
         storage.write("image_height", camera.height)
         storage.write("camera_matrix", camera.matrix())

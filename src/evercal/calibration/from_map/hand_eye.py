@@ -100,7 +100,7 @@ def hand_eye_of(
     reasons not to rely on the estimate.
     """
     correction = built.hand_eye
-    assert correction is not None, "the map was built for a hand-eye calibration"
+    assert correction, "the map was built for a hand-eye calibration"
     # The covariance of the correction is about camera axes, as that of a pose after an exact one.
     start_from_camera = UncertainPose(
         correction.start_camera_from_camera, correction.covariance
@@ -127,7 +127,7 @@ def hand_eye_of(
             "map": built.scene.digest,
         },
     )
-    if correction.arm is not None:
+    if correction.arm:
         calibration = _with_joints(calibration, correction.arm, frames)
     warnings = (*_warnings(built.adjusted), *warnings)
     advice = _advice(frames, estimate) if start.mount.moves else ""
@@ -183,7 +183,7 @@ def _advice(frames: Sequence[Frame], gripper_from_camera: UncertainPose) -> str:
 
 def _uses(frames: Sequence[Frame], built: BuiltMap) -> tuple[ImageUse, ...]:
     """Use of each frame; residuals are of its gripper pose, as all others predict it."""
-    assert built.hand_eye is not None, "the map was built for a hand-eye calibration"
+    assert built.hand_eye, "the map was built for a hand-eye calibration"
     uses = []
     for frame in frames:
         name = frame.name

@@ -77,7 +77,7 @@ class HandEyeStart:
 
     def posed(self, recording: Recording, frames: Sequence[Frame]) -> Recording:
         """The recording with rough camera poses of `frames`; its other ones count as untracked."""
-        if self.arm is not None:
+        if self.arm:
             frames = with_offsets(frames, self.arm)
         poses = scene_from_parent(frames, self.mount) @ self.parent_from_camera
         pairs = zip(frames, poses, strict=True)
@@ -106,7 +106,7 @@ def scene_from_parent(frames: Sequence[Frame], mount: Mount) -> SE3:
 
 def gripper_frames(recording: Recording) -> tuple[Frame, ...]:
     """Training frames with a gripper pose; too few are refused."""
-    frames = tuple(f for f in recording.train if f.base_from_gripper is not None)
+    frames = tuple(f for f in recording.train if f.base_from_gripper)
     require_frames(replace(recording, train=frames), MIN_GRIPPER_FRAMES)
     return frames
 
@@ -163,7 +163,7 @@ def _refuse_other_mount(
     if not rivals:
         return
     rival = min(rivals, key=lambda rival: rival.distance_deg)
-    if start is not None and rival.distance_deg > start.distance_deg / 2:
+    if start and rival.distance_deg > start.distance_deg / 2:
         return
     another = "the camera moves with the gripper ('evercal learn MAP RECORDING --calibration FILE')"
     if mount.moves:
@@ -193,7 +193,7 @@ def start_from_matches(
     fits = [epipolar.solve(start, centre) for start in starts]
     best = min(fits, key=lambda x: np.minimum(epipolar.medians(x), largest).mean())
     arm = None
-    if joints is not None:
+    if joints:
         epipolar.moving = lambda offsets: joints.matrices(offsets, mount)
         still = np.zeros(len(joints.arm.joints))
         best = epipolar.solve(np.r_[best, still], np.r_[centre, still])

@@ -78,7 +78,7 @@ def image_pairs(
             return ImagePair(i, j, rays)
 
         for done, pair in enumerate(pool.map(matched, candidates), start=1):
-            if pair is not None:
+            if pair:
                 pairs.append(pair)
             on_progress("matching", done, len(candidates))
     return pairs

@@ -50,7 +50,7 @@ def motion_warnings(
         Reasons not to rely on the calibration.
     """
     correction = built.hand_eye
-    assert correction is not None, "the map was built for a hand-eye calibration"
+    assert correction, "the map was built for a hand-eye calibration"
     used = [i for i, f in enumerate(frames) if f.name in correction.residuals]
     names = [frames[i].name for i in used]
     largest = None
@@ -60,11 +60,11 @@ def motion_warnings(
         (correction.moved, "the camera"),
     ):
         step = largest_step(np.array([residuals[name] for name in names]))
-        if step is not None and (largest is None or step.share > largest.share):
+        if step and (largest is None or step.share > largest.share):
             largest = step
             what = carrier
     drift_deg = drift_deg_of(background)
-    if largest is not None:
+    if largest:
         first = names[largest.before]
         if what == "the camera" and drift_deg < MOVED_DEG:
             return (

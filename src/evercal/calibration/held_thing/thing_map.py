@@ -59,7 +59,7 @@ def with_image_scatter(
     """
     base_from_camera = []
     for frame, pose in zip(frames, gripper_from_camera, strict=True):
-        if pose is not None and frame.base_from_gripper is not None:
+        if pose and frame.base_from_gripper:
             base_from_camera.append(frame.base_from_gripper @ pose)
     if len(base_from_camera) < 2:
         return estimate

@@ -359,7 +359,7 @@ def with_tested_size(
         )
         return free, freed, [warning]
     size = f"a square or tag of 24 mm would measure {24 * (1 + error):.2f} mm"
-    if corners is not None and corners.size_m is not None:
+    if corners and corners.size_m is not None:
         stated = 1000 * corners.size_m
         size = f"its side measures {stated * (1 + error):.2f} mm, not {stated:.2f} mm"
     warning = (

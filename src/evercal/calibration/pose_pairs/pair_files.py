@@ -196,7 +196,7 @@ def _read(
     if role == "camera" and stamps is None and table.names is not None:
         stamps = times_in_names(table.names)
     numbers = None
-    if table.numbers is not None and used is not None:
+    if table.numbers is not None and used:
         numbers = PoseNumbers(
             table.numbers,
             used,

@@ -131,7 +131,7 @@ class PairSolution:
 
     def _lenses(self) -> dict[str, Camera]:
         lenses = {}
-        if self.camera is not None and self.corners is not None:
+        if self.camera and self.corners:
             lenses["estimated"] = self.camera
             if self.corners.stated:
                 lenses["stated"] = self.corners.camera
@@ -174,7 +174,7 @@ class PairSolution:
             checks["time_offset_sigma_s"] = sigma["clock"]
         checks["scale"] = self.board_scale
         checks["scale_sigma"] = sigma["size"]
-        if self.lens is not None and self.corners is not None:
+        if self.lens and self.corners:
             checks["corner_sigma_px"] = self.lens.sigma_px
             checks["corners_left_out"] = list(self.corners.left_out)
             intrinsics = LENS[self.lens.camera.model]

@@ -115,7 +115,7 @@ def solve_pose_pairs(
     in_order = pairs[np.sort(rows)]
     require_agreement(in_order, mount, scale_known, start, own_camera)
     lens = None
-    if corners is not None:
+    if corners:
         refined = _by_corners(pairs, rows, mount, scale_known, corners)
         pairs, corners, lens, start, scale = refined
     problem = _Problem(mount, scale, scale_known, corners, of_board)
@@ -126,7 +126,7 @@ def solve_pose_pairs(
     sharing = replace(equation, shared=shared)
     evidence = evidence_of_shared(sharing[fit.inliers].system(fit.at))
     # Errors that poses share look like a step, and a step like errors that poses share.
-    if slip is not None and slip.evidence < evidence:
+    if slip and slip.evidence < evidence:
         slip = None
     if slip is None and evidence > WANTED:
         equation = sharing
@@ -139,7 +139,7 @@ def solve_pose_pairs(
     else:
         fit = replace(fit, covariance=fit.covariance + slip.spread)
         warnings.append(_slip_warning(slip, pairs.names, of_board))
-    if corners is not None and lens is not None:
+    if corners and lens:
         warnings += corner_warnings(fit, equation, corners, lens)
     if of_board:
         warnings += _mount_warnings(fit.at, mount)
@@ -281,7 +281,7 @@ class _Problem:
         The corners of `accepted` (n,) images estimate the intrinsics.
         """
         extras = Extras.nothing(len(pairs))
-        if self.corners is not None and lens is not None:
+        if self.corners and lens:
             pairs = lens.applied_to(pairs)
             extras = lens.extras(self.corners.prior, accepted)
         # The board's origin is a convention; noise about its middle is the same in any other.

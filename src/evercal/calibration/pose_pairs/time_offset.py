@@ -49,7 +49,7 @@ class CameraTrack:
     def __getitem__(self, index: BoolArray) -> "CameraTrack":
         rows = np.flatnonzero(index)
         corners = self.corners
-        if corners is not None:
+        if corners:
             corners = replace(corners, views=tuple(corners.views[row] for row in rows))
         names = tuple(self.names[row] for row in rows)
         return CameraTrack(

@@ -241,7 +241,7 @@ class _NetworkRun(_Run):
         self._remove()  # left by an interrupted commit
         scene = self.scenes[0]
         method = self.strategy.method
-        assert method is not None, "a network has a method"
+        assert method, "a network has a method"
         shared = self.store.with_name(f"first-{scene.name}-{self.stage.seed}")
         # Another process may be learning it.
         with FileLock(shared.with_name(f"{shared.name}.claim")):

@@ -105,7 +105,7 @@ def load_suite(
     if name not in SUITES:
         names = ", ".join([*SUITES, "custom", "regions"])
         raise InputError(f"suite {name!r}: unknown; choose one of {names}")
-    if poses is not None and name not in ("i7s", "i12s"):
+    if poses and name not in ("i7s", "i12s"):
         raise InputError(f"suite {name}: `poses` are for i7s and i12s")
     suite = SUITES[name]
     for scene in scenes:
@@ -129,7 +129,7 @@ def load_suite(
     for scene in names:
         # Names of scenes have no slashes: apt1/kitchen becomes apt1-kitchen.
         recording = load_recording(data / scene, name=scene.replace("/", "-"))
-        if poses is not None:
+        if poses:
             recording = with_sfm_poses(recording, poses, scene.replace("/", "_"))
         recordings.append(recording)
     return recordings

@@ -63,7 +63,7 @@ class NetworkLearnOptions:
 
     def stage_options(self) -> StageOptions:
         """Options of the stage."""
-        if self.stage is not None:
+        if self.stage:
             return self.stage
         stage = preset(self.preset, self.seed).with_memory(self.memory)
         if self.centres is None:
@@ -87,7 +87,7 @@ class NetworkLearnOptions:
         if not is_store(store):
             side = self.short_side or short_side(self.preset, frames)
             return NetworkStore.create(store, strategy.name, side, self.encoder)
-        if self.encoder is not None:
+        if self.encoder:
             raise InputError(
                 f"encoder {self.encoder}: store {store} keeps the encoder it was made with"
             )
@@ -148,7 +148,7 @@ def learn_networks(
             )
         recording = posed_recording(recording)
         require_frames(recording)
-        if options.cache is not None:
+        if options.cache:
             cache_features(contents.encoder, options.cache)
             contents.cache = options.cache
         split = split_held_out(recording.train)

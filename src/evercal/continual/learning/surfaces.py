@@ -126,7 +126,7 @@ def surface_points(
     for number, (start, end) in enumerate(pairwise(buffer.starts.tolist())):
         frame = frames[number % len(frames)]
         depth = depths[number % len(frames)]
-        assert frame.base_from_camera is not None, "training frames are posed"
+        assert frame.base_from_camera, "training frames are posed"
         focal, centre = all_intrinsics[number].reshape(2, 2)
         plane = (all_pixels[start:end] - centre) / focal
         ray = np.column_stack([plane, np.ones(len(plane))])

@@ -86,7 +86,7 @@ class ReplayHooks(MemoryHooks):
         """Compute the weighted penalty."""
         method = self.method
         old_output = output
-        if method.penalty.needs_teacher and self._teacher is not None:
+        if method.penalty.needs_teacher and self._teacher:
             old_output = teacher_output(self._teacher, rows)
         weight = method.weight
         if method.every_scene:

@@ -159,7 +159,7 @@ def fields_of(path: Path, size: Size | None = None) -> Fields:
     words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
     if all(map(is_number, words)):
         numbers = [*map(float, words)]
-        if len(numbers) == 1 and size is not None:
+        if len(numbers) == 1 and size:
             numbers = _centred(numbers[0], *size)
         return {"camera_matrix": numbers}
     try:

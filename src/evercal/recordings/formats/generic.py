@@ -180,7 +180,7 @@ class SceneWriter:
             "base_from_camera": pose_to_dict(frame.base_from_camera),
             "base_from_gripper": pose_to_dict(frame.base_from_gripper),
         }
-        if frame.depth is not None:
+        if frame.depth:
             entry["depth"] = f"depth/{stem}.png"
             (self._root / "depth").mkdir(exist_ok=True)
             self._copy(frame.depth, f"depth/{stem}.png")

@@ -36,7 +36,7 @@ _PARTS = {
 def pose_feature(root: Path, info: Info, options: ReadOptions) -> str:
     """Name of the feature with the poses, or with the joints where there is a URDF."""
     features = info["features"]
-    if options.urdf is not None:
+    if options.urdf:
         return _STATE
     if options.pose_convention is not None:
         column = options.gripper_frame or _STATE
@@ -84,7 +84,7 @@ def feature_poses(
 ) -> tuple[RobotPoses, list[str]]:
     """Poses from the (n, k) values of a feature, and notes."""
     names = _names(info, column)
-    if options.urdf is not None:
+    if options.urdf:
         return _joint_poses(root, names, values, options)
     count = values.shape[1]
     notes = []
@@ -110,7 +110,7 @@ def feature_poses(
 def _joint_poses(
     root: Path, names: list[str], values: Array, options: ReadOptions
 ) -> tuple[RobotPoses, list[str]]:
-    assert options.urdf is not None
+    assert options.urdf
     count = values.shape[1]
     source = f"{root}: {_STATE}"
     if len(names) != count:

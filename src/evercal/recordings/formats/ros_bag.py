@@ -91,7 +91,7 @@ def load(root: Path, options: ReadOptions) -> Recording:
     topic = _image_topic(bag, options.image_topic)
     shots, notes = _shots(bag, topic)
     height, width = shots[0].read().shape[:2]
-    if options.camera is not None:
+    if options.camera:
         camera = read_camera_of_size(options.camera, (width, height), topic)
     else:
         camera = _bag_camera(bag, topic, (width, height))

@@ -159,7 +159,7 @@ def _frames(root: Path, layout: RecordingLayout, options: ReadOptions) -> Record
     frames = []
     for image, camera, pose, values in zip(images, cameras, poses, joints, strict=True):
         has_joints = values is not None or rows.joints is None
-        if pose is not None and has_joints:
+        if pose and has_joints:
             angles = None if values is None else tuple(values.tolist())
             frame = Frame(split + image.name, image, camera, None, joints_rad=angles)
             frames.append(replace(frame, **{owner: pose}))
@@ -190,7 +190,7 @@ def _rows(
             numbers = np.roll(number_array(numbers, "'poses'"), 3, axis=-1)
             names = tuple(map(str, range(len(numbers))))
             return RobotPoses(names, None, poses_from_numbers(numbers, _RECORD3D)), []
-    if options.urdf is not None:
+    if options.urdf:
         raise InputError(
             f"`urdf`: {file} holds poses already; leave the option out, or give joint angles in"
             " joints.csv instead"

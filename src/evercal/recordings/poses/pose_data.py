@@ -178,7 +178,7 @@ def _of_object(data: Columns, given: Given, robot: bool) -> PoseTable:
         return _labelled(table, columns, plural=True)
     if has_arrays:
         table = _of_arrays(columns, given, plural=True)
-        if table is not None:
+        if table:
             return table
     if has_position([*_cells(_flat(columns))]):
         return pose_data([columns], given, robot)

@@ -62,7 +62,7 @@ def add_frustum(
 def place(node: viser.SceneNodeHandle, base_from_node: SE3 | None) -> None:
     """Move a node of the scene; None hides it."""
     node.visible = base_from_node is not None
-    if base_from_node is not None:
+    if base_from_node:
         node.wxyz = base_from_node.rotation_wxyz
         node.position = base_from_node.translation_m
 

@@ -63,7 +63,7 @@ class Page:
             default = scenes[0].adjusted_camera
             size_m = self.map.frustum_m
             drawing.add_calibrations(server, given, self.map, default, size_m)
-            if urdf is not None:
+            if urdf:
                 links = [c.parent_frame for c in given.values() if c.on_gripper]
                 bases = [one.frames.base for one in (*scenes, *given.values())]
                 drawing.add_arm(server, urdf, gripper, links, bases)

@@ -44,7 +44,7 @@ def poses_at_images(
     """Interpolate the pose of the gripper at n images in `camera_frame`, at `stamps_ns` (n,)."""
     zero = int(stamps_ns[0])
     stamps = (stamps_ns - zero).astype(float) * 1e-9
-    if options.urdf is not None:
+    if options.urdf:
         model = RobotModel(options.urdf, options.whole_robot)
         return _from_joints(bag, stamps, zero, model, options)
     tree, times = _tf(bag, zero, options.pose_topic)
