@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from benchmarks.accuracy import pose_error, wrong
-from benchmarks.board_images import CHARUCO, Photo
-from benchmarks.board_images import render as board_photo
+from benchmarks.board_images import CHARUCO, Photo, render as board_photo
 from benchmarks.calibration import as_wrist_recording, learned_mount
 from benchmarks.hand_eye import pose
 from benchmarks.rows import Row, grouped, median_of, numbers, once, save

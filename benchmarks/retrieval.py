@@ -27,8 +27,7 @@ from evercal.localization.options import LocalizeOptions
 from evercal.mapping.keyframes import Keyframes
 from evercal.mapping.map_frame import MapFrame
 from evercal.mapping.scene_map import MapContents, SceneMap
-from evercal.mapping.store import KEYFRAMES as KEYFRAMES_FILE
-from evercal.mapping.store import SCENE
+from evercal.mapping.store import KEYFRAMES as KEYFRAMES_FILE, SCENE
 from evercal.processes import python_command
 from evercal.recordings import Frame, Recording
 from evercal.recordings.samples import sample_rooms

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rooms import materials as m
-from rooms import prints
+from rooms import materials as m, prints
 from rooms.furniture import CLOTHS, PAINTS, FurnitureBuilder, pick
 from rooms.items import Item
 from rooms.materials import Material

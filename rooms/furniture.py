@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.random import Generator
 
-from rooms import materials as m
-from rooms import prints
+from rooms import materials as m, prints
 from rooms.items import Item
 from rooms.materials import Colour, Material
 from rooms.shapes import (

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from rooms import materials as m
-from rooms import prints
+from rooms import materials as m, prints
 from rooms.furniture import FurnitureBuilder
 from rooms.items import Item
 from rooms.shapes import (

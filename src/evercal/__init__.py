@@ -34,27 +34,33 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from evercal.calibration.calibration import Calibration as Calibration
-    from evercal.calibration.calibration import read_calibration as read_calibration
+    from evercal.calibration.calibration import (
+        Calibration as Calibration,
+        read_calibration as read_calibration,
+    )
     from evercal.calibration.drift import Shift as Shift
     from evercal.calibration.from_map.next_views import next_views as next_views
     from evercal.calibration.pose_pairs.pairs import PosePairs as PosePairs
     from evercal.calibration.pose_pairs.solve import solve as solve
     from evercal.errors import InputError as InputError
     from evercal.evaluation import Scores as Scores
-    from evercal.geometry import SE3 as SE3
-    from evercal.geometry import Camera as Camera
-    from evercal.geometry import UncertainPose as UncertainPose
+    from evercal.geometry import (
+        SE3 as SE3,
+        Camera as Camera,
+        UncertainPose as UncertainPose,
+    )
     from evercal.learning.report import LearnReport as LearnReport
     from evercal.localization.estimate import PoseEstimate as PoseEstimate
     from evercal.localization.options import LocalizeOptions as LocalizeOptions
     from evercal.map import Map as Map
     from evercal.mapping.build import MapOptions as MapOptions
-    from evercal.recordings import Frame as Frame
-    from evercal.recordings import ReadOptions as ReadOptions
-    from evercal.recordings import Recording as Recording
-    from evercal.recordings import load_recording as load_recording
-    from evercal.recordings import read_image as read_image
+    from evercal.recordings import (
+        Frame as Frame,
+        ReadOptions as ReadOptions,
+        Recording as Recording,
+        load_recording as load_recording,
+        read_image as read_image,
+    )
     from evercal.robot.frame_names import FrameNames as FrameNames
     from evercal.service.client import Client as Client
 

@@ -12,10 +12,8 @@ import pytest
 from evercal.calibration.audit import audit
 from evercal.calibration.calibration import Calibration, ErrorTerm, largest_term, rig_of
 from evercal.calibration.drift import check
-from evercal.calibration.from_images import _lens_advice as lens_advice
-from evercal.calibration.from_images import calibrate
-from evercal.calibration.from_map.spots import _spots as spots_of
-from evercal.calibration.from_map.spots import from_many_spots
+from evercal.calibration.from_images import _lens_advice as lens_advice, calibrate
+from evercal.calibration.from_map.spots import _spots as spots_of, from_many_spots
 from evercal.calibration.image_source import Images
 from evercal.calibration.located import ImagePose, fuse, in_parent_frame
 from evercal.errors import InputError

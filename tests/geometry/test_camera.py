@@ -6,8 +6,7 @@ from itertools import product
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from evercal.choices import CameraModel
 from evercal.geometry import Camera

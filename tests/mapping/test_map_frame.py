@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
 from evercal.mapping.map_frame import (

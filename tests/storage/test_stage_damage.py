@@ -7,8 +7,13 @@ from pathlib import Path
 import pytest
 
 from evercal.errors import InputError
-from evercal.storage import MANIFEST, Manifest, verify, write_manifest
-from evercal.storage import manifest as module
+from evercal.storage import (
+    MANIFEST,
+    Manifest,
+    manifest as module,
+    verify,
+    write_manifest,
+)
 from evercal.storage.stages import SCHEMA, StageStore, read_store
 
 from .stores import NETWORK, Tree, add, change_by, opened, texts

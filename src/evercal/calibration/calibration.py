@@ -26,9 +26,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, get_args
 import numpy as np
 
 from evercal.calibration.checks import Checks
-from evercal.calibration.framed_pose import FramedPose
-from evercal.calibration.framed_pose import ImageUse as ImageUse
-from evercal.calibration.framed_pose import JointOffset as JointOffset
+from evercal.calibration.framed_pose import (
+    FramedPose,
+    ImageUse as ImageUse,
+    JointOffset as JointOffset,
+)
 from evercal.choices import ExportFormat
 from evercal.classes import frozen, frozen_arrays, html_table
 from evercal.errors import InputError

@@ -6,21 +6,27 @@ The readers are loaded on first use: a program that only locates images needs no
 import importlib
 from typing import TYPE_CHECKING
 
-from evercal.recordings.frame import MIN_TRAIN_FRAMES as MIN_TRAIN_FRAMES
-from evercal.recordings.frame import Frame as Frame
-from evercal.recordings.frame import Recording as Recording
-from evercal.recordings.frame import posed_frames as posed_frames
-from evercal.recordings.frame import posed_recording as posed_recording
-from evercal.recordings.frame import stated_poses as stated_poses
-from evercal.recordings.images import as_rgb as as_rgb
-from evercal.recordings.images import image_size as image_size
-from evercal.recordings.images import read_image as read_image
-from evercal.recordings.images import write_image as write_image
+from evercal.recordings.frame import (
+    MIN_TRAIN_FRAMES as MIN_TRAIN_FRAMES,
+    Frame as Frame,
+    Recording as Recording,
+    posed_frames as posed_frames,
+    posed_recording as posed_recording,
+    stated_poses as stated_poses,
+)
+from evercal.recordings.images import (
+    as_rgb as as_rgb,
+    image_size as image_size,
+    read_image as read_image,
+    write_image as write_image,
+)
 
 if TYPE_CHECKING:
     from evercal.recordings.formats import generic as generic
-    from evercal.recordings.load import FORMATS as FORMATS
-    from evercal.recordings.load import load_recording as load_recording
+    from evercal.recordings.load import (
+        FORMATS as FORMATS,
+        load_recording as load_recording,
+    )
     from evercal.recordings.poses.robot_poses import (
         read_robot_poses as read_robot_poses,
     )

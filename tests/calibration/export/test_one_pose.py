@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 import yaml
 import yourdfpy
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 

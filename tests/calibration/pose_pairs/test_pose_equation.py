@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from benchmarks.hand_eye import Setting, SimulatedPairs, recording
 from evercal.calibration.pose_pairs.pairs import PosePairs

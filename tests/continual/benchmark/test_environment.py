@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from evercal.continual.benchmark import environment as module
-from evercal.continual.benchmark import results
+from evercal.continual.benchmark import environment as module, results
 from evercal.continual.benchmark.environment import environment
 
 

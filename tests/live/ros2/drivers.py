@@ -19,8 +19,7 @@ import cv2
 import numpy as np
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
-from cyclonedds.idl import IdlStruct
-from cyclonedds.idl import types as t
+from cyclonedds.idl import IdlStruct, types as t
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 

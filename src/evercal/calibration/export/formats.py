@@ -4,8 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, TypeAlias, Unpack
 
-from evercal.calibration.export import joints as arm
-from evercal.calibration.export import writers as to
+from evercal.calibration.export import joints as arm, writers as to
 from evercal.calibration.export.read_back import require_read_back
 from evercal.calibration.export.request import (
     Export,

@@ -26,8 +26,8 @@ from evercal.calibration.pose_pairs.fit import (
 )
 from evercal.calibration.pose_pairs.mistakes import require_agreement
 from evercal.calibration.pose_pairs.noise_levels import evidence_of_shared
-from evercal.calibration.pose_pairs.pairs import BoardCorners as BoardCorners
 from evercal.calibration.pose_pairs.pairs import (
+    BoardCorners as BoardCorners,
     Measured,
     PosePairs,
     measured,

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evercal.continual.benchmark import comparison
-from evercal.continual.benchmark import results as stored
+from evercal.continual.benchmark import comparison, results as stored
 from evercal.continual.benchmark.figures import line_style, new_figure, tidy
 from evercal.continual.benchmark.paper_tables import ablation_table, latex, paper_table
 from evercal.continual.benchmark.results import Table
