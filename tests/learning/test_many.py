@@ -121,8 +121,8 @@ def test_a_results_file_is_used_if_it_is_that_of_the_recording(
     first, second = (task.result_of(room) for room in small[:2])
     assert first is not None
     assert second is not None
-    expected = task.learn(0, small[0])
-    task.learn(1, small[1])
+    expected = task.done(0, small[0])
+    task.done(1, small[1])
     right = Path(first).read_bytes()
     unpack_map(Path(first), tmp_path / "one")
     empty = MapStore.open(tmp_path / "one")
@@ -140,23 +140,23 @@ def test_a_results_file_is_used_if_it_is_that_of_the_recording(
     for message, content in damaged.items():
         caplog.clear()
         Path(first).write_bytes(content)
-        learned = task.learn(0, small[0])
+        learned = task.done(0, small[0])
         assert learned.scene is not None
         assert learned.scene.name == "alpha"
         assert re.search(
             f"{Path(first).name} is not the result of.*{message}", caplog.text
         )
         caplog.clear()
-        assert task.learn(0, small[0]).scene is not None
+        assert task.done(0, small[0]).scene is not None
         assert not caplog.text
     Path(first).write_bytes(right)
     Path(renamed).write_bytes(right)
     caplog.clear()
-    other = smaller.learn(0, small[0])
+    other = smaller.done(0, small[0])
     assert other.report is not None
     assert f"it was written as '{Path(first).name}'" in caplog.text
     caplog.clear()
-    kept = task.learn(0, small[0])
+    kept = task.done(0, small[0])
     assert not caplog.text
     assert kept.report is not None
     assert expected.report is not None

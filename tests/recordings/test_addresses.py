@@ -99,7 +99,7 @@ def test_messages_show_addresses_without_secrets(text: str, shown: str) -> None:
 def test_outcomes_and_names_hold_no_secrets() -> None:
     source = RecordingAt.of("nosuch://user:SECRET@host/room?key=SECRET")
     assert source.name == "room"
-    error = LearnTask(MapContents(load_encoder(), 64)).learn(0, source).error
+    error = LearnTask(MapContents(load_encoder(), 64)).done(0, source).error
     assert error.startswith("nosuch://host/room: cannot be read or written (ValueErr")
     assert "SECRET" not in error
     assert RecordingAt.of("ftp://user:SECRET@host").name == "host"
@@ -179,7 +179,7 @@ def test_what_is_no_recording_is_refused_before_it_is_copied(
     assert Flaky.fetched == ["/cell/other/b.txt"]
     # The same where many are learned.
     task = LearnTask(MapContents(load_encoder(), 64))
-    error = task.learn(0, RecordingAt.of(other)).error
+    error = task.done(0, RecordingAt.of(other)).error
     assert error.startswith("flaky://cell/other: no known scene format")
     assert len(Flaky.fetched) == 2
     with pytest.raises(InputError, match="flaky://cell/gone: no such folder or file"):

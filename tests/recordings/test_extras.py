@@ -20,7 +20,7 @@ from .checks import refused
     [
         ("pycolmap", "colmap", lambda path: reconstruct(path, path / "out")),
         ("rosbags.highlevel", "bags", BagFile),
-        ("pyarrow.parquet", "lerobot", lambda path: lerobot._columns(path, [])),
+        ("pyarrow.parquet", "lerobot", lambda path: lerobot.columns(path, [])),
         ("av", "lerobot", lambda _: Videos(30.0)),
     ],
 )

@@ -4,13 +4,15 @@ The processes are those of this machine, or workers of a Ray cluster (`learning.
 is killed, for example for its memory, costs its recording another try, alone.
 """
 
+import itertools
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from evercal.errors import InputError
-from evercal.learning.on_ray import learn_on_ray
-from evercal.learning.task import Item, Learned, LearnTask, Source
+from evercal.learning.on_ray import done_on_ray
+from evercal.learning.task import Item, Learned, LearnTask, Source, Task
 from evercal.processes import Worker, cause_of, cores, first_answers
 from evercal.progress import OnProgress
 from evercal.recordings.addresses import RecordingAt, is_address
@@ -20,8 +22,6 @@ from evercal.typing import PathLike
 
 TRIES = 3
 """Attempts before a recording whose process is killed is given up."""
-_State = tuple[LearnTask, int]
-"""Task and threads of a worker."""
 
 
 def learn_scenes(
@@ -42,10 +42,23 @@ def learn_scenes(
     waiting = list(enumerate(sources))
     # All scenes share the centroids, which the first recording of another encoder determines.
     while waiting and task.contents.encoder.centroids is None:
-        yield task.learn(*waiting.pop(0))
+        yield task.done(*waiting.pop(0))
+    yield from each_done(task, waiting, min(workers, max(1, len(waiting))), ray)
+
+
+def each_done(
+    task: Task,
+    items: Iterable[Item],
+    workers: int,
+    ray: str | None = None,
+) -> Iterator[Any]:
+    """Do numbered work in worker processes, and yield outcomes as they are ready.
+
+    Items are taken when a worker is free for them.
+    """
     if ray is not None:
-        return (yield from learn_on_ray(task, waiting, ray))
-    ended = yield from _in_turn(task, waiting, workers)
+        return (yield from done_on_ray(task, items, ray))
+    ended = yield from _in_turn(task, items, workers)
     for item, status in ended:
         tries = 1
         # Alone, so that others do not share its memory.
@@ -56,28 +69,29 @@ def learn_scenes(
             status = again[0][1]
             tries = tries + 1
         else:
-            yield Learned(item[0], error=cause_of(status, tries))
+            yield task.failed(*item, cause_of(status, tries))
 
 
 def _in_turn(
-    task: LearnTask, items: Sequence[Item], workers: int
-) -> Generator[Learned, None, list[tuple[Item, int]]]:
-    """Learn items; return those whose process ended, each with its exit status."""
-    waiting = list(items)
+    task: Task, items: Iterable[Item], workers: int
+) -> Generator[Any, None, list[tuple[Item, int]]]:
+    """Do work; return the items whose process ended, each with its exit status."""
+    waiting = iter(items)
     ended = list[tuple[Item, int]]()
-    workers = min(workers, len(waiting))
-    threads = max(1, cores() // max(workers, 1))
-    state: _State = (task, threads)
+    threads = max(1, cores() // workers)
+    state = (task, threads)
     idle = list[Worker]()
     busy = dict[Worker, Item]()
     try:
-        while waiting or busy:
-            while waiting and len(busy) < workers:
+        while True:
+            for item in itertools.islice(waiting, workers - len(busy)):
                 worker = (
                     idle.pop() if idle else Worker(_begin, state, _few_threads(threads))
                 )
-                worker.ask(waiting[0])
-                busy[worker] = waiting.pop(0)
+                worker.ask(item)
+                busy[worker] = item
+            if not busy:
+                break
             for worker in first_answers([*busy]):
                 item = busy.pop(worker)
                 try:
@@ -100,12 +114,12 @@ def _few_threads(threads: int) -> dict[str, str]:
     )
 
 
-def _begin(state: _State) -> Callable[[Item], Learned]:
+def _begin(state: tuple[Any, int]) -> Callable[[Item], Any]:
     import cv2
 
     task, threads = state
     cv2.setNumThreads(threads)
-    return lambda item: task.learn(*item)
+    return lambda item: task.done(*item)
 
 
 def named_sources(

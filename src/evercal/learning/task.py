@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -42,8 +43,20 @@ class Learned:
 
 
 Source = Recording | RecordingAt
-Item = tuple[int, Source]
-"""A recording with its place among those given."""
+Item = tuple[int, Any]
+"""Such as a recording, with its place among those given."""
+
+
+class Task(Protocol):
+    """What is done in worker processes; it can be pickled."""
+
+    def done(self, number: int, source: Any) -> Any:
+        """Do one of many things, and return the outcome."""
+        ...
+
+    def failed(self, number: int, source: Any, error: str) -> Any:
+        """The outcome for one whose process ended."""
+        ...
 
 
 @frozen_arrays
@@ -62,7 +75,7 @@ class LearnTask:
     results: str | None = None
     """Folder or address where learned scenes are kept: what lies there is not learned again."""
 
-    def learn(self, number: int, source: Source) -> Learned:
+    def done(self, number: int, source: Source) -> Learned:
         """Learn one recording; an unusable one becomes an outcome."""
         try:
             file = self.result_of(source)
@@ -76,6 +89,10 @@ class LearnTask:
         except InputError as error:
             return Learned(number, error=str(error))
         return Learned(number, *learned)
+
+    def failed(self, number: int, source: Source, error: str) -> Learned:
+        """The outcome for a recording whose process ended."""
+        return Learned(number, error=error)
 
     def _learn(self, source: Source) -> tuple[SceneMap, LearnReport]:
         if isinstance(source, Recording):

@@ -60,22 +60,18 @@ def load(root: Path, options: ReadOptions) -> Recording:
 
 
 def _load(root: Path, options: ReadOptions) -> Recording:
-    info = _info(root)
-    key = _camera_key(root, info, options.image_topic)
+    info = dataset_info(root)
+    key = camera_key(root, info, options.image_topic)
     if options.camera is None:
         raise InputError(
             f"{root}: LeRobot datasets hold no intrinsics; give them with `camera`"
         )
-    shape = [int(n) for n in info["features"][key]["shape"]]
-    if shape[0] == 3:  # some state channels first
-        shape = shape[1:]
-    height, width = shape[:2]
-    camera = read_camera_of_size(options.camera, (width, height), key)
+    camera = read_camera_of_size(options.camera, image_size_of(info, key), key)
     column = pose_feature(root, info, options)
     rows, values = _rows(root, column)
     stated, notes = feature_poses(root, info, column, values, options)
     frames = []
-    for i, image in enumerate(_images(root, info, key, rows)):
+    for i, image in enumerate(images_of(root, info, key, rows)):
         row = rows[i]
         name = f"episode_{row.episode:06d}/{row.number:06d}"
         joints = stated.joints_of(i)
@@ -98,7 +94,8 @@ def _load(root: Path, options: ReadOptions) -> Recording:
     )
 
 
-def _info(root: Path) -> Info:
+def dataset_info(root: Path) -> Info:
+    """The content of info.json; versions and paths that are not read are refused."""
     info: Info = read_json(root / INFO, "LeRobot dataset")
     version = str(info["codebase_version"])
     features = info["features"]
@@ -115,13 +112,18 @@ def _info(root: Path) -> Info:
     return info
 
 
-def _camera_key(root: Path, info: Info, wanted: str | None) -> str:
-    keys = []
-    for key, feature in info["features"].items():
-        # Stated in `info`, in older versions under other names.
-        is_depth = re.search(r"is_depth_map'\W+True", str(feature))
-        if feature.get("dtype") in ("video", "image") and not is_depth:
-            keys.append(key)
+def image_size_of(info: Info, key: str) -> tuple[int, int]:
+    """Width and height of the images of a feature."""
+    shape = [int(n) for n in info["features"][key]["shape"]]
+    if shape[0] == 3:  # some state channels first
+        shape = shape[1:]
+    height, width = shape[:2]
+    return width, height
+
+
+def camera_key(root: Path, info: Info, wanted: str | None) -> str:
+    """The feature of the images that are wanted, or the only one."""
+    keys = picture_keys(info)
     if wanted is None and len(keys) == 1:
         return keys[0]
     if wanted in keys:
@@ -132,7 +134,18 @@ def _camera_key(root: Path, info: Info, wanted: str | None) -> str:
     )
 
 
-class _Row(NamedTuple):
+def picture_keys(info: Info) -> list[str]:
+    """Features of colour images."""
+    keys = []
+    for key, feature in info["features"].items():
+        # Stated in `info`, in older versions under other names.
+        is_depth = re.search(r"is_depth_map'\W+True", str(feature))
+        if feature.get("dtype") in ("video", "image") and not is_depth:
+            keys.append(key)
+    return keys
+
+
+class Row(NamedTuple):
     """One image and its place in the tables."""
 
     episode: int
@@ -145,19 +158,19 @@ class _Row(NamedTuple):
     """Index of the row in `file`."""
 
 
-def _rows(root: Path, column: str) -> tuple[list[_Row], Array]:
+def _rows(root: Path, column: str) -> tuple[list[Row], Array]:
     files = files_in(root / "data", (".parquet",), "*/*")
     if not files:
         raise InputError(
             f"{root / 'data'}: no parquet files; download the data folder too"
         )
-    rows: list[_Row] = []
+    rows: list[Row] = []
     tables = []
     for file in files:
         names = ["episode_index", "frame_index", "timestamp", column]
-        *cells, poses = _columns(file, names)
+        *cells, poses = columns(file, names)
         for i, (episode, number, seconds) in enumerate(zip(*cells, strict=True)):
-            rows.append(_Row(episode, number, seconds, file, i))
+            rows.append(Row(episode, number, seconds, file, i))
         with named_errors(file, column):
             values = number_array(poses, column)
         if values.ndim != 2 or not np.isfinite(values).all():
@@ -168,9 +181,10 @@ def _rows(root: Path, column: str) -> tuple[list[_Row], Array]:
     return rows, np.concatenate(tables)
 
 
-def _images(
-    root: Path, info: Info, key: str, rows: Sequence[_Row]
+def images_of(
+    root: Path, info: Info, key: str, rows: Sequence[Row]
 ) -> list[StoredImage]:
+    """The images of a camera at some rows."""
     if info["features"][key]["dtype"] == "image":
         return [_Embedded(root, key, row.file, row.row) for row in rows]
     videos = Videos(float(info["fps"]))
@@ -200,10 +214,20 @@ def _video_starts(
             path = video(episode_chunk=i // size, episode_index=i)
             starts[i] = (path, 0.0)
         return starts
+    return _starts_in_files(root, str(info["video_path"]), key)
+
+
+@functools.lru_cache(maxsize=4)
+def _starts_in_files(
+    root: Path, template: str, key: str
+) -> dict[int, tuple[Path, float]]:
+    """The same, for all episodes of version 3."""
+    video = functools.partial(_video, root, template, video_key=key)
+    starts: dict[int, tuple[Path, float]] = {}
     parts = ("chunk_index", "file_index", "from_timestamp")
     names = ["episode_index", *(f"videos/{key}/{part}" for part in parts)]
     for file in files_in(root / "meta" / "episodes", (".parquet",), "*/*"):
-        for episode, chunk, number, start in zip(*_columns(file, names), strict=True):
+        for episode, chunk, number, start in zip(*columns(file, names), strict=True):
             path = video(chunk_index=chunk, file_index=number)
             starts[int(episode)] = (path, float(start))
     return starts
@@ -228,7 +252,8 @@ def _parquet(path: Path) -> Iterator[Any]:
         yield table
 
 
-def _columns(file: Path, names: list[str]) -> list[list[Any]]:
+def columns(file: Path, names: list[str]) -> list[list[Any]]:
+    """Some columns of a table."""
     with _parquet(file) as table:
         read = table.read(columns=names)
         return [read[name].to_pylist() for name in names]

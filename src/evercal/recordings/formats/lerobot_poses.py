@@ -24,7 +24,7 @@ from evercal.typing import Array, Record
 
 Info: TypeAlias = Record
 """Content of info.json, or of a feature in it."""
-_STATE = "observation.state"
+STATE = "observation.state"
 """Feature of the joints."""
 _PARTS = {
     "xyzw": ("x", "y", "z", "qx", "qy", "qz", "qw"),
@@ -37,9 +37,9 @@ def pose_feature(root: Path, info: Info, options: ReadOptions) -> str:
     """Name of the feature with the poses, or with the joints where there is a URDF."""
     features = info["features"]
     if options.urdf:
-        return _STATE
+        return STATE
     if options.pose_convention is not None:
-        column = options.gripper_frame or _STATE
+        column = options.gripper_frame or STATE
         if column not in features:
             names = ", ".join(features)
             raise InputError(
@@ -51,13 +51,13 @@ def pose_feature(root: Path, info: Info, options: ReadOptions) -> str:
     keys = []
     for key in features:
         if key.startswith("observation"):
-            names = _names(info, key)
+            names = names_of(info, key)
             observed[key] = names
             is_chosen = arm is None or arm in (key, *_arms(names))
             if is_chosen and _convention_of(names):
                 keys.append(key)
-    if _STATE in keys:
-        return _STATE
+    if STATE in keys:
+        return STATE
     if len(keys) == 1:
         return keys[0]
     if keys:
@@ -83,7 +83,7 @@ def feature_poses(
     options: ReadOptions,
 ) -> tuple[RobotPoses, list[str]]:
     """Poses from the (n, k) values of a feature, and notes."""
-    names = _names(info, column)
+    names = names_of(info, column)
     if options.urdf:
         return _joint_poses(root, names, values, options)
     count = values.shape[1]
@@ -112,7 +112,7 @@ def _joint_poses(
 ) -> tuple[RobotPoses, list[str]]:
     assert options.urdf
     count = values.shape[1]
-    source = f"{root}: {_STATE}"
+    source = f"{root}: {STATE}"
     if len(names) != count:
         raise InputError(f"{source} has {count} numbers and {len(names)} names")
     with named_errors(source, "names"):
@@ -163,7 +163,7 @@ def _of_arm(names: list[str], arm: str) -> list[str]:
     return [name if name.rpartition(".")[0] == arm else "" for name in names]
 
 
-def _names(info: Info, column: str) -> list[str]:
+def names_of(info: Info, column: str) -> list[str]:
     """Names of the numbers of a feature."""
     names = info["features"].get(column, {}).get("names") or []
     if isinstance(
@@ -174,4 +174,6 @@ def _names(info: Info, column: str) -> list[str]:
         for key, group in groups.items():
             prefix = f"{key}." if len(groups) > 1 else ""
             names += [f"{prefix}{name}" for name in group]
+    if len(names) == 1 and isinstance(names[0], list):  # some nest them once more
+        names = names[0]
     return [str(name).removesuffix(".pos") for name in names]

@@ -69,6 +69,22 @@ class Videos:
         self._open: OrderedDict[Path, _Open] = OrderedDict()
         self._lock = threading.Lock()
 
+    def __reduce__(self) -> tuple[Any, ...]:  # without the open videos
+        return Videos, (0.5 / self._half,)
+
+    @classmethod
+    def of(cls, path: Path) -> "Videos":
+        """For videos with the frame rate of a file."""
+        videos = cls(1.0)
+        videos.frame(path, 0.0)
+        rate = videos._open[path].stream.average_rate
+        return cls(float(rate))
+
+    @property
+    def step_s(self) -> float:
+        """Time between two frames, seconds."""
+        return 2 * self._half
+
     def frame(self, path: Path, seconds: float) -> Image:
         """Decode the frame at a time in seconds since the first frame to (H, W, 3) uint8 RGB."""
         with self._lock:

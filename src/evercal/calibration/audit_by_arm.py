@@ -1,0 +1,197 @@
+"""Stated poses of fixed cameras in recorded episodes, compared with the arm in their images."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Literal, Protocol
+
+import numpy as np
+
+from evercal.calibration.stated_mistakes import Reading, readings
+from evercal.classes import frozen, frozen_arrays
+from evercal.errors import InputError
+from evercal.geometry import SE3, UncertainPose, pose_distance_mm_deg
+from evercal.recordings.episodes.episode import Episode, Numbers
+from evercal.recordings.poses.conventions import (
+    PoseConvention,
+    numbers_from_poses,
+    pose_convention,
+)
+from evercal.robot.robot_model import RobotModel
+
+LARGEST_SQUARE = 22.5
+"""Squared Mahalanobis distance that one of 1,000 right poses exceeds (chi-squared, 6 degrees of
+freedom)."""
+_USUAL = {6: "rpy", 7: "xyzw"}
+"""Conventions by count of numbers; else a matrix."""
+
+
+@frozen_arrays
+class ArmPose:
+    """Where images of an arm show the camera."""
+
+    base_from_camera: UncertainPose
+    confirmed: float
+    """Share of the arm's outline that the images show."""
+
+
+class ArmImages(Protocol):
+    """The images of a camera in an episode."""
+
+    def near(self, starts: Sequence[SE3]) -> ArmPose | None:
+        """Fit the best of some base_from_camera; None if the images do not confirm the arm."""
+        ...
+
+    def anywhere(self) -> ArmPose:
+        """Find the pose without a start; InputError if the images do not confirm the arm."""
+        ...
+
+
+@frozen
+class Audited:
+    """Result for a camera in an episode."""
+
+    episode: str
+    camera: str
+    stated: Numbers
+    """Pose in the data set."""
+    verdict: Literal["right", "wrong", "unknown"]
+    """Whether the stated pose fits the images; unknown if they do not decide it."""
+    reason: str
+    mistake: str = ""
+    """What is wrong, if it is a usual mistake."""
+    corrected: Numbers = ()
+    """The estimated pose in the notation of the data set; empty if there is none."""
+    translation_mm: float | None = None
+    """Distance of the stated pose from the estimated one."""
+    rotation_deg: float | None = None
+    sigma_mm: float | None = None
+    """Standard deviation of the estimated pose."""
+    sigma_deg: float | None = None
+    confirmed: float | None = None
+    """Share of the arm's outline that the images show."""
+    seconds: float = 0.0
+
+
+Source = tuple[Episode, Sequence[SE3]]
+"""An episode, and poses of its camera in other episodes."""
+
+
+@frozen_arrays
+class ArmAudit:
+    """How episodes are audited; a task of `learning.many`."""
+
+    model: RobotModel
+    look: Callable[[Episode], ArmImages]
+    convention: str | None = None
+    """Of the stated poses; if omitted, the usual one for so many numbers."""
+    of_all: SE3 | None = None
+    """base_from_camera of cameras without a stated pose."""
+    agreement: tuple[float, float] = (20.0, 1.0)
+    """Largest difference that still agrees, millimetres and degrees."""
+
+    def done(self, number: int, source: Source) -> Audited:
+        """Audit an episode."""
+        start = time.perf_counter()
+        try:
+            result = self._audited(*source)
+        except InputError as error:
+            result = self.failed(number, source, str(error))
+        return replace(result, seconds=time.perf_counter() - start)
+
+    def failed(self, number: int, source: Source, error: str) -> Audited:
+        """The result for an episode that cannot be audited."""
+        episode = source[0]
+        stated = episode.stated.get(episode.camera, ())
+        return Audited(episode.name, episode.camera, stated, "unknown", error)
+
+    def convention_of(self, numbers: Numbers) -> PoseConvention:
+        """The convention of stated numbers."""
+        usual = _USUAL.get(len(numbers), "matrix")
+        return pose_convention(self.convention or usual)
+
+    def _audited(self, episode: Episode, known: Sequence[SE3]) -> Audited:
+        if episode.problem:
+            raise InputError(episode.problem)
+        possible = [*self._readings(episode)]
+        stated = self.of_all
+        if possible and not possible[0][0]:
+            stated = possible.pop(0)[1]
+        images = self.look(episode)
+        found = None
+        if stated is not None:
+            found = images.near([stated])
+        if found is None:
+            single = [pose for words, pose in possible if len(words) == 1]
+            found = images.near([*known, *single]) or images.anywhere()
+        estimate = found.base_from_camera
+        result = self.failed(0, (episode, known), "states no pose")
+        convention = self.convention_of(result.stated)
+        corrected = numbers_from_poses(estimate.pose, convention)
+        result = replace(
+            result,
+            corrected=tuple(corrected.tolist()),
+            sigma_mm=estimate.sigma_mm,
+            sigma_deg=estimate.sigma_deg,
+            confirmed=found.confirmed,
+        )
+        if stated is not None:
+            return self._compared(result, stated, estimate, possible)
+        if not result.stated:
+            return result
+        return replace(
+            result,
+            verdict="wrong",
+            reason=f"its numbers are no pose as {convention.name}",
+            mistake=self._mistake(estimate.pose, possible),
+        )
+
+    def _compared(
+        self,
+        result: Audited,
+        stated: SE3,
+        estimate: UncertainPose,
+        possible: Sequence[Reading],
+    ) -> Audited:
+        mm, degrees = pose_distance_mm_deg(stated, estimate.pose)
+        reason = f"stated pose is {mm:.0f} mm and {degrees:.1f} deg from the images"
+        result = replace(result, translation_mm=mm, rotation_deg=degrees, reason=reason)
+        if self._agree(stated, estimate.pose):
+            return replace(result, verdict="right")
+        if estimate.squared_mahalanobis(stated) < LARGEST_SQUARE:
+            return result
+        mistake = self._mistake(estimate.pose, possible)
+        return replace(result, verdict="wrong", mistake=mistake)
+
+    def _readings(self, episode: Episode) -> Iterator[Reading]:
+        """What the stated numbers may mean; first as they are stated, if that is a pose."""
+        for camera in (episode.camera, *episode.stated):
+            numbers = episode.stated.get(camera, ())
+            for words, pose in readings(numbers, self.convention_of(numbers)):
+                if camera == episode.camera:
+                    yield words, pose
+                elif not words:
+                    yield (f"that of {camera}",), pose
+                if not words:
+                    for link, base_from_link in self._links(episode):
+                        yield (f"relative to {link}",), base_from_link @ pose
+
+    def _links(self, episode: Episode) -> Iterator[tuple[str, SE3]]:
+        """base_from_link of the links that move, in the first image."""
+        values = episode.frames[0].joints_rad or ()
+        known = dict(zip(episode.joints, values, strict=True))
+        for link in self.model.links:
+            arm = self.model.arm(self.model.base_link, link)
+            if arm.joints and known.keys() >= {*arm.joints}:
+                row = [known[name] for name in arm.joints]
+                yield link, arm.poses(np.array([row]))[0]
+
+    def _agree(self, a: SE3, b: SE3) -> bool:
+        difference = pose_distance_mm_deg(a, b)
+        return bool(np.all(np.less_equal(difference, self.agreement)))
+
+    def _mistake(self, pose: SE3, possible: Sequence[Reading]) -> str:
+        for words, other in possible:
+            if self._agree(other, pose):
+                return ", ".join(words)
+        return ""
