@@ -3,10 +3,11 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
+from evercal.calibration.episode_images import EpisodeImages
 from evercal.calibration.stated_mistakes import Reading, readings
 from evercal.classes import frozen, frozen_arrays
 from evercal.errors import InputError
@@ -24,27 +25,6 @@ LARGEST_SQUARE = 22.5
 freedom)."""
 _USUAL = {6: "rpy", 7: "xyzw"}
 """Conventions by count of numbers; else a matrix."""
-
-
-@frozen_arrays
-class ArmPose:
-    """Where images of an arm show the camera."""
-
-    base_from_camera: UncertainPose
-    confirmed: float
-    """Share of the arm's outline that the images show."""
-
-
-class ArmImages(Protocol):
-    """The images of a camera in an episode."""
-
-    def near(self, starts: Sequence[SE3]) -> ArmPose | None:
-        """Fit the best of some base_from_camera; None if the images do not confirm the arm."""
-        ...
-
-    def anywhere(self) -> ArmPose:
-        """Find the pose without a start; InputError if the images do not confirm the arm."""
-        ...
 
 
 @frozen
@@ -82,7 +62,7 @@ class ArmAudit:
     """How episodes are audited; a task of `learning.many`."""
 
     model: RobotModel
-    look: Callable[[Episode], ArmImages]
+    look: Callable[[Episode], EpisodeImages]
     convention: str | None = None
     """Of the stated poses; if omitted, the usual one for so many numbers."""
     of_all: SE3 | None = None
@@ -118,12 +98,13 @@ class ArmAudit:
         if possible and not possible[0][0]:
             stated = possible.pop(0)[1]
         images = self.look(episode)
+        starts = [pose for words, pose in possible if len(words) == 1]
         found = None
         if stated is not None:
-            found = images.near([stated])
-        if found is None:
-            single = [pose for words, pose in possible if len(words) == 1]
-            found = images.near([*known, *single]) or images.anywhere()
+            found = images.beside(stated)
+            starts.append(stated)
+        if found is None or not self._agree(stated, found.base_from_camera.pose):
+            found = images.near([*known, *starts]) or images.anywhere()
         estimate = found.base_from_camera
         result = self.failed(0, (episode, known), "states no pose")
         convention = self.convention_of(result.stated)
@@ -186,7 +167,9 @@ class ArmAudit:
                 row = [known[name] for name in arm.joints]
                 yield link, arm.poses(np.array([row]))[0]
 
-    def _agree(self, a: SE3, b: SE3) -> bool:
+    def _agree(self, a: SE3 | None, b: SE3) -> bool:
+        if a is None:
+            return False
         difference = pose_distance_mm_deg(a, b)
         return bool(np.all(np.less_equal(difference, self.agreement)))
 

@@ -44,7 +44,7 @@ class Audit(args.Verb):
     urdf: args.File = None
     """URDF of the robot, with its meshes: the arm in the images shows the camera's pose."""
     camera: args.File = None
-    """With --urdf: intrinsics of the cameras; for DROID also the intrinsics.json of all episodes."""
+    """With --urdf: intrinsics of the cameras; for DROID also its intrinsics.json."""
     image_topic: args.Topic = None
     """With --urdf: audit this camera of a LeRobot data set only."""
     pose_convention: args.Name = None
@@ -60,8 +60,8 @@ class Audit(args.Verb):
     workers: args.Count = None
     """With --urdf: processes. Default: one for each core."""
     ray: args.Address = None
-    """With --urdf: audit on a Ray cluster: auto, HOST:PORT or ray://HOST:PORT. All its machines reach
-    the data set."""
+    """With --urdf: audit on a Ray cluster: auto, HOST:PORT or ray://HOST:PORT. All its machines
+    reach the data set."""
 
     def run(self) -> int:
         numbers = (self.images, self.most_mm, self.most_deg)
@@ -103,8 +103,8 @@ class Audit(args.Verb):
                 "--urdf: give the folder of one data set, and intrinsics with --camera"
             )
         require_writable(self.out, "--out")
-        from evercal.calibration.arm_in_view.episode_images import episode_images
         from evercal.calibration.audit_by_arm import ArmAudit
+        from evercal.calibration.episode_images import EpisodeImages
         from evercal.learning.audits import audit_episodes, corrections, with_moves
         from evercal.processes import cores
         from evercal.recordings.episodes import episodes_in
@@ -120,7 +120,7 @@ class Audit(args.Verb):
         )
         audit = ArmAudit(
             model,
-            partial(episode_images, urdf, self.without),
+            partial(EpisodeImages, urdf, self.without),
             self.pose_convention,
             args.transform_of(self.calibration),
             (self.most_mm or 20.0, self.most_deg or 1.0),

@@ -91,8 +91,10 @@ def with_moves(results: Iterable[Audited]) -> list[Audited]:
 
 
 def corrections(results: Iterable[Audited]) -> dict[str, dict[str, Numbers]]:
-    """Camera poses by episode and camera in the notation of the data set: as stated where they are
-    right, else as the images show them."""
+    """Camera poses by episode and camera in the notation of the data set.
+
+    They are as stated where that is right, else as the images show them.
+    """
     poses: dict[str, dict[str, Numbers]] = {}
     for result in results:
         pose = result.corrected

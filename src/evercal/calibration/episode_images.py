@@ -1,0 +1,111 @@
+"""Where the images of an episode show the camera: near poses that are tried, or anywhere."""
+
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from evercal.calibration.arm_in_view.covariance import in_base, parts
+from evercal.calibration.arm_in_view.fit import ArmFit, Fitter, TooFewPoints
+from evercal.calibration.arm_in_view.solve import fit_arm, priors_of
+from evercal.calibration.arm_in_view.starts import Overlap
+from evercal.calibration.arm_in_view.views import ArmViews
+from evercal.classes import frozen_arrays
+from evercal.errors import InputError
+from evercal.geometry import SE3, UncertainPose
+from evercal.recordings.episodes.episode import Episode
+from evercal.robot.link_shapes import RobotBody, robot_body
+from evercal.robot.pose_errors import ArmErrors
+from evercal.robot.robot_model import RobotModel
+from evercal.typing import Strings
+
+LEAST_CONFIRMED = 0.3
+"""Least share of the arm's outline that the images show at a pose; wrong ones show up to 0.33 of it
+beside wrong starts, right ones 0.46 and more."""
+TRIED = 3
+"""Starts that are fitted, of those that overlap most with what moves."""
+_BESIDE_PX = (8, 5)
+"""How far outlines are searched in the steps of a fit, in pixels of an image of 640."""
+_NEAR_PX = (30, 15, 8, 5, 4, 4)
+_LEARN_AT = (0, 2)
+_SPACING_PX = 4.0
+
+
+@frozen_arrays
+class ArmPose:
+    """Where images of an arm show the camera."""
+
+    base_from_camera: UncertainPose
+    confirmed: float
+    """Share of the arm's outline that the images show."""
+
+
+class EpisodeImages:
+    """Images of a camera in an episode."""
+
+    def __init__(self, urdf: Path, without: Strings, episode: Episode) -> None:
+        body = _body(urdf, without, episode.joints)
+        self._fitter = Fitter(ArmViews.of(episode.frames, body))
+        self._priors = priors_of(body, ArmErrors())
+        if not self._fitter.moving.any():
+            raise InputError("the arm does not move in the images")
+
+    def beside(self, start: SE3) -> ArmPose | None:
+        """Fit every second image in few steps; None if the images do not confirm the arm."""
+        return self._fit(start, range(0, len(self._fitter.views), 2), _BESIDE_PX)
+
+    def near(self, starts: Sequence[SE3]) -> ArmPose | None:
+        """Fit the best of some base_from_camera; None if the images do not confirm the arm."""
+        views = self._fitter.views
+        overlap = Overlap(views, self._fitter.moving)
+        every = np.arange(len(views))
+        scores = [overlap.score(s.inverse().matrix(), every) for s in starts]
+        fits = []
+        for i in np.argsort(scores)[::-1][:TRIED]:
+            fits.append(self._fit(starts[i], range(len(views)), _NEAR_PX, _LEARN_AT))
+        confirmed = filter(None, fits)
+        return max(confirmed, key=lambda pose: pose.confirmed, default=None)
+
+    def anywhere(self) -> ArmPose:
+        """Find the pose without a start; InputError if the images do not confirm the arm."""
+        found = _pose(fit_arm(self._fitter, self._priors, lambda *_: None))
+        if found.confirmed < LEAST_CONFIRMED:
+            raise InputError(
+                f"the images show {100 * found.confirmed:.0f} % of the outline of the arm at the"
+                f" best pose, {100 * LEAST_CONFIRMED:.0f} % are required"
+            )
+        return found
+
+    def _fit(
+        self,
+        start: SE3,
+        images: Sequence[int],
+        reaches: Sequence[float],
+        learn_at: Sequence[int] = (),
+    ) -> ArmPose | None:
+        zoom = max(0.5, max(self._fitter.views.size) / 640)
+        try:
+            found = self._fitter.fit(
+                self._fitter.start(start.inverse()),
+                self._priors,
+                images,
+                [zoom * reach for reach in reaches],
+                _SPACING_PX,
+                learn_at,
+            )
+        except (TooFewPoints, np.linalg.LinAlgError, cv2.error):
+            return None
+        return _pose(found) if found.confirmed >= LEAST_CONFIRMED else None
+
+
+@functools.lru_cache(maxsize=2)
+def _body(urdf: Path, without: Strings, joints: Strings) -> RobotBody:
+    return robot_body(RobotModel(urdf), joints, without=without)
+
+
+def _pose(fit: ArmFit) -> ArmPose:
+    whole = sum((part for part, _ in parts(fit).values()), np.zeros(()))
+    pose = fit.estimate.camera_from_base.inverse()
+    return ArmPose(UncertainPose(pose, in_base(fit, whole)), fit.confirmed)
