@@ -10,6 +10,7 @@ VERBS = {
         "maps",
         "accuracy of maps: degraded images, fixed cameras, wrong poses, many scenes",
     ),
+    "audit": ("audit", "wrong camera poses in data sets, found by the arm in view"),
     "calibration": (
         "calibration",
         "cameras calibrated from images, beside the simulator's truth",

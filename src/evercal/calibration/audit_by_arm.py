@@ -7,7 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from evercal.calibration.episode_images import EpisodeImages
+from evercal.calibration.arm_in_view.result import LEAST_CONFIRMED
+from evercal.calibration.episode_images import ArmPose, EpisodeImages
 from evercal.calibration.stated_mistakes import Reading, readings
 from evercal.classes import frozen, frozen_arrays
 from evercal.errors import InputError
@@ -23,6 +24,9 @@ from evercal.robot.robot_model import RobotModel
 LARGEST_SQUARE = 22.5
 """Squared Mahalanobis distance that one of 1,000 right poses exceeds (chi-squared, 6 degrees of
 freedom)."""
+MORE_CONFIRMED = 1.25
+"""Ratio of the shares of the outline that the images show at another pose and beside the stated one,
+above which the stated one is wrong."""
 _USUAL = {6: "rpy", 7: "xyzw"}
 """Conventions by count of numbers; else a matrix."""
 
@@ -51,6 +55,7 @@ class Audited:
     confirmed: float | None = None
     """Share of the arm's outline that the images show."""
     seconds: float = 0.0
+    """CPU time."""
 
 
 Source = tuple[Episode, Sequence[SE3]]
@@ -72,12 +77,12 @@ class ArmAudit:
 
     def done(self, number: int, source: Source) -> Audited:
         """Audit an episode."""
-        start = time.perf_counter()
+        start = time.process_time()
         try:
             result = self._audited(*source)
         except InputError as error:
             result = self.failed(number, source, str(error))
-        return replace(result, seconds=time.perf_counter() - start)
+        return replace(result, seconds=time.process_time() - start)
 
     def failed(self, number: int, source: Source, error: str) -> Audited:
         """The result for an episode that cannot be audited."""
@@ -93,20 +98,32 @@ class ArmAudit:
     def _audited(self, episode: Episode, known: Sequence[SE3]) -> Audited:
         if episode.problem:
             raise InputError(episode.problem)
-        possible = [*self._readings(episode)]
-        stated = self.of_all
-        if possible and not possible[0][0]:
-            stated = possible.pop(0)[1]
-        images = self.look(episode)
-        starts = [pose for words, pose in possible if len(words) == 1]
-        found = None
-        if stated is not None:
-            found = images.beside(stated)
-            starts.append(stated)
-        if found is None or not self._agree(stated, found.base_from_camera.pose):
-            found = images.near([*known, *starts]) or images.anywhere()
-        estimate = found.base_from_camera
         result = self.failed(0, (episode, known), "states no pose")
+        possible = [*self._readings(episode, result.stated)]
+        images = self.look(episode)
+        beside = None
+        if possible and not possible[0][0]:
+            beside = images.beside(possible[0][1])
+            if beside.confirmed >= LEAST_CONFIRMED:
+                result = self._compared(result, possible, beside)
+                if result.verdict == "right":
+                    return result
+        starts = [pose for words, pose in possible if len(words) <= 1]
+        found = images.near([*known, *starts]) or images.anywhere()
+        result = self._compared(result, possible, found)
+        if beside is None or result.verdict != "wrong":
+            return result
+        same = self._agree(beside.base_from_camera.pose, found.base_from_camera.pose)
+        if same or found.confirmed > MORE_CONFIRMED * beside.confirmed:
+            return result
+        reason = f"{result.reason}, which show hardly less of the arm at the stated one"
+        return replace(result, verdict="unknown", mistake="", reason=reason)
+
+    def _compared(
+        self, result: Audited, possible: Sequence[Reading], found: ArmPose
+    ) -> Audited:
+        """The result with the pose that images show."""
+        estimate = found.base_from_camera
         convention = self.convention_of(result.stated)
         corrected = numbers_from_poses(estimate.pose, convention)
         result = replace(
@@ -116,46 +133,37 @@ class ArmAudit:
             sigma_deg=estimate.sigma_deg,
             confirmed=found.confirmed,
         )
-        if stated is not None:
-            return self._compared(result, stated, estimate, possible)
-        if not result.stated:
+        if not possible:
             return result
-        return replace(
-            result,
-            verdict="wrong",
-            reason=f"its numbers are no pose as {convention.name}",
-            mistake=self._mistake(estimate.pose, possible),
-        )
-
-    def _compared(
-        self,
-        result: Audited,
-        stated: SE3,
-        estimate: UncertainPose,
-        possible: Sequence[Reading],
-    ) -> Audited:
-        mm, degrees = pose_distance_mm_deg(stated, estimate.pose)
-        reason = f"stated pose is {mm:.0f} mm and {degrees:.1f} deg from the images"
-        result = replace(result, translation_mm=mm, rotation_deg=degrees, reason=reason)
-        if self._agree(stated, estimate.pose):
-            return replace(result, verdict="right")
-        if estimate.squared_mahalanobis(stated) < LARGEST_SQUARE:
-            return result
-        mistake = self._mistake(estimate.pose, possible)
-        return replace(result, verdict="wrong", mistake=mistake)
-
-    def _readings(self, episode: Episode) -> Iterator[Reading]:
-        """What the stated numbers may mean; first as they are stated, if that is a pose."""
-        for camera in (episode.camera, *episode.stated):
-            numbers = episode.stated.get(camera, ())
-            for words, pose in readings(numbers, self.convention_of(numbers)):
-                if camera == episode.camera:
-                    yield words, pose
-                elif not words:
-                    yield (f"that of {camera}",), pose
+        words, stated = possible[0]
+        reason = f"its numbers are no pose as {convention.name}"
+        if not words:
+            mm, degrees = pose_distance_mm_deg(stated, estimate.pose)
+            reason = f"stated pose is {mm:.0f} mm and {degrees:.1f} deg from the images"
+            result = replace(result, translation_mm=mm, rotation_deg=degrees)
+        result = replace(result, verdict="wrong", reason=reason)
+        for words, pose in possible:
+            if self._agree(pose, estimate.pose):
                 if not words:
-                    for link, base_from_link in self._links(episode):
-                        yield (f"relative to {link}",), base_from_link @ pose
+                    return replace(result, verdict="right")
+                return replace(result, mistake=", ".join(words))
+        if not possible[0][0] and estimate.squared_mahalanobis(stated) < LARGEST_SQUARE:
+            return replace(result, verdict="unknown")
+        return result
+
+    def _readings(self, episode: Episode, numbers: Numbers) -> Iterator[Reading]:
+        """What the stated numbers may mean; first as they are stated, if that is a pose."""
+        if self.of_all is not None and not numbers:
+            yield (), self.of_all
+        for words, pose in readings(numbers, self.convention_of(numbers)):
+            yield words, pose
+            if not words:
+                for link, base_from_link in self._links(episode):
+                    yield (f"relative to {link}",), base_from_link @ pose
+        for camera, other in episode.stated.items():
+            for words, pose in readings(other, self.convention_of(other)):
+                if not words and camera != episode.camera:
+                    yield (f"that of {camera}",), pose
 
     def _links(self, episode: Episode) -> Iterator[tuple[str, SE3]]:
         """base_from_link of the links that move, in the first image."""
@@ -167,14 +175,6 @@ class ArmAudit:
                 row = [known[name] for name in arm.joints]
                 yield link, arm.poses(np.array([row]))[0]
 
-    def _agree(self, a: SE3 | None, b: SE3) -> bool:
-        if a is None:
-            return False
+    def _agree(self, a: SE3, b: SE3) -> bool:
         difference = pose_distance_mm_deg(a, b)
         return bool(np.all(np.less_equal(difference, self.agreement)))
-
-    def _mistake(self, pose: SE3, possible: Sequence[Reading]) -> str:
-        for words, other in possible:
-            if self._agree(other, pose):
-                return ", ".join(words)
-        return ""

@@ -9,6 +9,7 @@ import numpy as np
 
 from evercal.calibration.arm_in_view.covariance import in_base, parts
 from evercal.calibration.arm_in_view.fit import ArmFit, Fitter, TooFewPoints
+from evercal.calibration.arm_in_view.result import LEAST_CONFIRMED
 from evercal.calibration.arm_in_view.solve import fit_arm, priors_of
 from evercal.calibration.arm_in_view.starts import Overlap
 from evercal.calibration.arm_in_view.views import ArmViews
@@ -21,15 +22,11 @@ from evercal.robot.pose_errors import ArmErrors
 from evercal.robot.robot_model import RobotModel
 from evercal.typing import Strings
 
-LEAST_CONFIRMED = 0.3
-"""Least share of the arm's outline that the images show at a pose; wrong ones show up to 0.33 of it
-beside wrong starts, right ones 0.46 and more."""
 TRIED = 3
 """Starts that are fitted, of those that overlap most with what moves."""
-_BESIDE_PX = (8, 5)
+_SHORT_PX = (30, 15, 8)
 """How far outlines are searched in the steps of a fit, in pixels of an image of 640."""
-_NEAR_PX = (30, 15, 8, 5, 4, 4)
-_LEARN_AT = (0, 2)
+_LAST_PX = (8, 5, 4)
 _SPACING_PX = 4.0
 
 
@@ -52,9 +49,9 @@ class EpisodeImages:
         if not self._fitter.moving.any():
             raise InputError("the arm does not move in the images")
 
-    def beside(self, start: SE3) -> ArmPose | None:
-        """Fit every second image in few steps; None if the images do not confirm the arm."""
-        return self._fit(start, range(0, len(self._fitter.views), 2), _BESIDE_PX)
+    def beside(self, start: SE3, reaches: Sequence[float] = _LAST_PX[:2]) -> ArmPose:
+        """Fit every second image in few steps."""
+        return self._fit(start, range(0, len(self._fitter.views), 2), reaches)
 
     def near(self, starts: Sequence[SE3]) -> ArmPose | None:
         """Fit the best of some base_from_camera; None if the images do not confirm the arm."""
@@ -62,21 +59,18 @@ class EpisodeImages:
         overlap = Overlap(views, self._fitter.moving)
         every = np.arange(len(views))
         scores = [overlap.score(s.inverse().matrix(), every) for s in starts]
-        fits = []
+        best = None
         for i in np.argsort(scores)[::-1][:TRIED]:
-            fits.append(self._fit(starts[i], range(len(views)), _NEAR_PX, _LEARN_AT))
-        confirmed = filter(None, fits)
-        return max(confirmed, key=lambda pose: pose.confirmed, default=None)
+            found = self.beside(starts[i], _SHORT_PX)
+            if best is None or found.confirmed > best.confirmed:
+                best = found
+        if best is None or best.confirmed < LEAST_CONFIRMED:
+            return None
+        return self._fit(best.base_from_camera.pose, every, _LAST_PX, (0,))
 
     def anywhere(self) -> ArmPose:
         """Find the pose without a start; InputError if the images do not confirm the arm."""
-        found = _pose(fit_arm(self._fitter, self._priors, lambda *_: None))
-        if found.confirmed < LEAST_CONFIRMED:
-            raise InputError(
-                f"the images show {100 * found.confirmed:.0f} % of the outline of the arm at the"
-                f" best pose, {100 * LEAST_CONFIRMED:.0f} % are required"
-            )
-        return found
+        return _pose(fit_arm(self._fitter, self._priors, lambda *_: None))
 
     def _fit(
         self,
@@ -84,7 +78,7 @@ class EpisodeImages:
         images: Sequence[int],
         reaches: Sequence[float],
         learn_at: Sequence[int] = (),
-    ) -> ArmPose | None:
+    ) -> ArmPose:
         zoom = max(0.5, max(self._fitter.views.size) / 640)
         try:
             found = self._fitter.fit(
@@ -96,8 +90,8 @@ class EpisodeImages:
                 learn_at,
             )
         except (TooFewPoints, np.linalg.LinAlgError, cv2.error):
-            return None
-        return _pose(found) if found.confirmed >= LEAST_CONFIRMED else None
+            return ArmPose(UncertainPose.exact(start), 0.0)
+        return _pose(found)
 
 
 @functools.lru_cache(maxsize=2)
