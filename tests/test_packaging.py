@@ -114,6 +114,7 @@ def test_the_licence_of_every_package_is_listed() -> None:
             "bags",
             "boards",
             "colmap",
+            "droid",
             "lerobot",
             "networks",
             "ray",

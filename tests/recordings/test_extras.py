@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from evercal.recordings.episodes import droid
 from evercal.recordings.formats import lerobot
 from evercal.recordings.formats.bags.file import BagFile
 from evercal.recordings.formats.video_file import Videos
@@ -22,6 +23,7 @@ from .checks import refused
         ("rosbags.highlevel", "bags", BagFile),
         ("pyarrow.parquet", "lerobot", lambda path: lerobot.columns(path, [])),
         ("av", "lerobot", lambda _: Videos(30.0)),
+        ("h5py", "droid", droid.joint_values),
     ],
 )
 def test_missing_extra_names_the_install_command(

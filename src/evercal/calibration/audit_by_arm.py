@@ -12,7 +12,7 @@ from evercal.calibration.episode_images import ArmPose, EpisodeImages
 from evercal.calibration.stated_mistakes import Reading, readings
 from evercal.classes import frozen, frozen_arrays
 from evercal.errors import InputError
-from evercal.geometry import SE3, UncertainPose, pose_distance_mm_deg
+from evercal.geometry import SE3, pose_distance_mm_deg
 from evercal.recordings.episodes.episode import Episode, Numbers
 from evercal.recordings.poses.conventions import (
     PoseConvention,
@@ -25,8 +25,10 @@ LARGEST_SQUARE = 22.5
 """Squared Mahalanobis distance that one of 1,000 right poses exceeds (chi-squared, 6 degrees of
 freedom)."""
 MORE_CONFIRMED = 1.25
-"""Ratio of the shares of the outline that the images show at another pose and beside the stated one,
-above which the stated one is wrong."""
+"""Ratio of the shares of the outline that images show at another pose and beside the stated one, above
+which the stated one is wrong."""
+_NAMING = 2.0
+"""Tolerance of poses without a mistake, in that of right poses: they are far from each other."""
 _USUAL = {6: "rpy", 7: "xyzw"}
 """Conventions by count of numbers; else a matrix."""
 
@@ -125,10 +127,13 @@ class ArmAudit:
         """The result with the pose that images show."""
         estimate = found.base_from_camera
         convention = self.convention_of(result.stated)
-        corrected = numbers_from_poses(estimate.pose, convention)
+
+        def noted(pose: SE3) -> Numbers:
+            return tuple(numbers_from_poses(pose, convention).tolist())
+
         result = replace(
             result,
-            corrected=tuple(corrected.tolist()),
+            corrected=noted(estimate.pose),
             sigma_mm=estimate.sigma_mm,
             sigma_deg=estimate.sigma_deg,
             confirmed=found.confirmed,
@@ -136,19 +141,23 @@ class ArmAudit:
         if not possible:
             return result
         words, stated = possible[0]
-        reason = f"its numbers are no pose as {convention.name}"
+        result = replace(
+            result, verdict="wrong", reason=f"no pose as {convention.name}"
+        )
         if not words:
             mm, degrees = pose_distance_mm_deg(stated, estimate.pose)
             reason = f"stated pose is {mm:.0f} mm and {degrees:.1f} deg from the images"
-            result = replace(result, translation_mm=mm, rotation_deg=degrees)
-        result = replace(result, verdict="wrong", reason=reason)
+            result = replace(
+                result, reason=reason, translation_mm=mm, rotation_deg=degrees
+            )
+            if self._agree(stated, estimate.pose):
+                return replace(result, verdict="right")
+            if estimate.squared_mahalanobis(stated) < LARGEST_SQUARE:
+                return replace(result, verdict="unknown")
         for words, pose in possible:
-            if self._agree(pose, estimate.pose):
-                if not words:
-                    return replace(result, verdict="right")
-                return replace(result, mistake=", ".join(words))
-        if not possible[0][0] and estimate.squared_mahalanobis(stated) < LARGEST_SQUARE:
-            return replace(result, verdict="unknown")
+            if words and self._agree(pose, estimate.pose, _NAMING):
+                mistake = ", ".join(words)
+                return replace(result, mistake=mistake, corrected=noted(pose))
         return result
 
     def _readings(self, episode: Episode, numbers: Numbers) -> Iterator[Reading]:
@@ -175,6 +184,6 @@ class ArmAudit:
                 row = [known[name] for name in arm.joints]
                 yield link, arm.poses(np.array([row]))[0]
 
-    def _agree(self, a: SE3, b: SE3) -> bool:
-        difference = pose_distance_mm_deg(a, b)
-        return bool(np.all(np.less_equal(difference, self.agreement)))
+    def _agree(self, a: SE3, b: SE3, times: float = 1.0) -> bool:
+        difference = np.array(pose_distance_mm_deg(a, b))
+        return bool((difference <= times * np.array(self.agreement)).all())

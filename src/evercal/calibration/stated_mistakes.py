@@ -23,7 +23,7 @@ def readings(numbers: Sequence[float], stated: PoseConvention) -> list[Reading]:
     """Poses of numbers by the stated convention and by others, the fewest mistakes first."""
     layouts = {stated.layout: stated.base}
     for name, base in CONVENTIONS.items():
-        if len(numbers) in base.counts:
+        if len(numbers) in base.counts and base.metres_per_unit == 1:
             layouts.setdefault(base.layout, name)
     units = (":m", ":mm"), (":rad", ":deg") if stated.has_angles else ("",)
     found = []

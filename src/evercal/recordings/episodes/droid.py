@@ -64,7 +64,7 @@ def episodes(
         for number in _CAMERAS:
             pose = tuple(map(float, data[f"{number}_cam_extrinsics"]))
             stated[str(data[f"{number}_cam_serial"])] = pose
-        values = _joint_values(file.parent / "trajectory.h5")
+        values = joint_values(file.parent / "trajectory.h5")
         names, values = values_of_joints(
             model, [""] * values.shape[1], values, options.pose_convention
         )
@@ -98,8 +98,8 @@ def _cameras(file: Path) -> Callable[[str, str], Camera]:
     return of
 
 
-def _joint_values(file: Path) -> Array:
-    """(n, k) of a trajectory."""
+def joint_values(file: Path) -> Array:
+    """(n, k) joint values of a trajectory."""
     h5py = optional_module("h5py", f"{file}: DROID's files need h5py", "droid")
     with library_errors(f"{file}: cannot be read"), h5py.File(file) as trajectory:
         values = trajectory[_JOINTS]
