@@ -25,8 +25,8 @@ LARGEST_SQUARE = 22.5
 """Squared Mahalanobis distance that one of 1,000 right poses exceeds (chi-squared, 6 degrees of
 freedom)."""
 MORE_CONFIRMED = 1.25
-"""Ratio of the shares of the outline that images show at another pose and beside the stated one, above
-which the stated one is wrong."""
+"""Ratio of the shares of the outline that images show at another pose and beside the stated one,
+above which that is wrong."""
 _NAMING = 2.0
 """Tolerance of poses without a mistake, in that of right poses: they are far from each other."""
 _USUAL = {6: "rpy", 7: "xyzw"}
