@@ -15,12 +15,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from tyro.conf import Positional, arg
 
-from benchmarks.audit_sets import KINDS, Options, write_droid, write_lerobot
+from benchmarks.audit_cells import Options, panda
+from benchmarks.audit_sets import KINDS, write_droid, write_lerobot
 from benchmarks.rows import Row, save
 from evercal.geometry import SE3, pose_distance_mm_deg
 from evercal.processes import python_command
 from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
-from rooms.panda import _folder
 
 WRITERS = {"lerobot": write_lerobot, "droid": write_droid}
 EXACT = (20.0, 1.0)
@@ -43,7 +43,7 @@ def run(
         workers: Processes of the audit.
         out: File of the rows.
     """
-    urdf = Path(*_folder().parts[:-2]) / "urdf" / "panda.urdf"
+    urdf = panda()
     root = folder / layout
     if not (folder / "truth.json").exists():
         WRITERS[layout](options, urdf, root)

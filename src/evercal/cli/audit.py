@@ -109,8 +109,10 @@ class Audit(args.Verb):
         from evercal.processes import cores
         from evercal.recordings.episodes import episodes_in
         from evercal.recordings.read_options import ReadOptions
+        from evercal.robot.link_shapes import robot_body
         from evercal.robot.robot_model import RobotModel
         from evercal.storage import write_json
+        from evercal.storage.text_files import named_errors
 
         model = RobotModel(urdf)
         options = ReadOptions(image_topic=self.image_topic, pose_convention=self.joints)
@@ -125,6 +127,9 @@ class Audit(args.Verb):
             args.transform_of(self.calibration),
             (self.most_mm or 20.0, self.most_deg or 1.0),
         )
+        with named_errors("--pose-convention", "convention"):
+            audit.convention_of(())
+        robot_body(model, (), without=self.without)  # refuses what is no robot
         rows = self.out and self.out.with_suffix(".rows")
         audited = audit_episodes(
             audit, episodes, rows, self.workers or cores(), self.ray
