@@ -235,7 +235,7 @@ def write_lerobot(options: Options, urdf: Path, folder: Path) -> None:
 
 def write_droid(options: Options, urdf: Path, folder: Path) -> None:
     """Write folders in DROID's layout."""
-    import h5py
+    import h5py  # pyright: ignore[reportMissingImports]
 
     truths: dict[str, Any] = {}
     camera: Camera | None = None

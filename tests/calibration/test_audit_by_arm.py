@@ -76,7 +76,8 @@ def audited(
     others = {"front": numbers_from_poses(OTHER, pose_convention("rpy")).tolist()}
     stated = {"side": tuple(numbers), **others} if len(numbers) else {}
     episode = Episode("e", "side", (frame,), ("shoulder", "reach"), stated)
-    audit = ArmAudit(model, lambda _: shown, **more)
+    look: Any = lambda _: shown  # noqa: E731
+    audit = ArmAudit(model, look, **more)
     return audit.done(0, (episode, known))
 
 

@@ -89,7 +89,9 @@ def test_wrong_poses_are_found_named_and_repaired(run, data_set, tmp_path):
     )
     assert f"episode_000002 {STATED}: other unit of length: " in second
     # The pose in the images is another one than in the episode before.
-    assert re.search(rf"episode_000003 {STATED}: stated pose is [34]. mm and 0.8", third)
+    assert re.search(
+        rf"episode_000003 {STATED}: stated pose is [34]. mm and 0.8", third
+    )
     assert last == "3 of 4 camera poses are wrong, 0 unknown"
     written = json.loads(out.read_text())
     poses = [episode[STATED] for episode in written["extrinsics"].values()]

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from evercal.calibration.audit_by_arm import ArmAudit, Audited
+from evercal.calibration.audit_by_arm import ArmAudit, Audited, Source
 from evercal.calibration.episode_images import EpisodeImages
-from evercal.geometry import SE3
 from evercal.learning.audits import audit_episodes, corrections, with_moves
 from evercal.recordings.episodes.episode import Episode
 from evercal.robot.robot_model import RobotModel
@@ -53,7 +52,7 @@ def test_poses_of_earlier_episodes_are_handed_on(audit: ArmAudit) -> None:
     handed = []
 
     class Noting(ArmAudit):
-        def done(self, number: int, source: tuple[Episode, list[SE3]]) -> Audited:
+        def done(self, number: int, source: Source) -> Audited:
             handed.append([pose.translation_m[0] for pose in source[1]])
             corrected = (float(number), 0.0, 0.0, 0.0, 0.0, 0.0)
             return Audited(

@@ -66,11 +66,12 @@ class EpisodeImages:
                 best = found
         if best is None or best.confirmed < LEAST_CONFIRMED:
             return None
-        return self._fit(best.base_from_camera.pose, every, _LAST_PX, (0,))
+        start = best.base_from_camera.pose
+        return self._fit(start, range(len(views)), _LAST_PX, (0,))
 
     def anywhere(self) -> ArmPose:
         """Find the pose without a start; InputError if the images do not confirm the arm."""
-        return _pose(fit_arm(self._fitter, self._priors, lambda *_: None))
+        return _pose(fit_arm(self._fitter, self._priors))
 
     def _fit(
         self,

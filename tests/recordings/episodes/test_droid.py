@@ -31,7 +31,7 @@ def write_episode(root: Path, name: str = NAME) -> Path:
     folder.mkdir(parents=True)
     with h5py.File(folder / "trajectory.h5", "w") as file:
         file[JOINTS] = values
-    data = {"uuid": name}
+    data: dict[str, Any] = {"uuid": name}
     for number, serial in enumerate(SERIALS):
         data[f"ext{number + 1}_cam_serial"] = serial
         data[f"ext{number + 1}_cam_extrinsics"] = [number, 0, 1, 0, 0, 0.5]
