@@ -14,6 +14,7 @@ from evercal.calibration.transform_file import read_transform
 from evercal.geometry import SE3, pose_distance_mm_deg
 from evercal.recordings import load_recording
 
+from . import arm_cell
 from .live.ros2.graphs import environment
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -21,11 +22,11 @@ NUMBERED = sorted(EXAMPLES.glob("[0-9]*.py"))
 slow = pytest.mark.slow("examples")
 
 
-def example(name: str, folder: Path) -> str:
+def example(name: str, folder: Path, *words: str) -> str:
     """Run an example in a folder; return what it prints."""
     path = os.pathsep.join([str(EXAMPLES.parent / "src"), *sys.path])
     done = subprocess.run(
-        [sys.executable, EXAMPLES / name],
+        [sys.executable, EXAMPLES / name, *words],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": path},
         check=False,
@@ -37,7 +38,7 @@ def example(name: str, folder: Path) -> str:
 
 
 def test_all_are_numbered_short_and_have_a_test() -> None:
-    assert [path.name[:2] for path in NUMBERED] == [f"{i:02}" for i in range(1, 11)]
+    assert [path.name[:2] for path in NUMBERED] == [f"{i:02}" for i in range(1, 12)]
     tests = Path(__file__).read_text("utf-8")
     tests += (Path(__file__).parent / "service" / "test_client.py").read_text("utf-8")
     for path in NUMBERED:
@@ -58,6 +59,14 @@ def test_tripod(cell: Path, tmp_path: Path) -> None:
     shift = re.search(r"moved: True, ([\d.]+) mm", output)
     assert shift is not None
     assert 4 < float(shift[1]) < 6
+
+
+def test_arm_in_view(tmp_path: Path) -> None:
+    arm_cell.write(tmp_path / "tripod")
+    output = example("11_arm_in_view.py", tmp_path, "tripod")
+    assert "turn its offset turns the frame of the base" in output
+    true = arm_cell.BASE_FROM_CAMERA
+    assert pose_distance_mm_deg(read_transform(tmp_path / "tripod.json"), true)[0] < 2
 
 
 @slow

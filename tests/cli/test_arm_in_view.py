@@ -90,6 +90,10 @@ def test_what_cannot_be_compared_is_refused(
     for words, message in (
         (["check", str(still), "--reference", str(file)], "a camera on the gripper"),
         (["arm-in-view", str(still)], "the arm does not move"),
+        (
+            ["check", str(still), "--reference", str(file), "--scene", "x"],
+            "give images that show a scene of a map",
+        ),
     ):
         assert main(words) == 2
         assert message in capsys.readouterr().err

@@ -67,8 +67,11 @@ class Check(args.Verb):
 
         reference = read_calibration(self.reference)
         if not self.images:
-            if args.strategy_of(self.store):
-                raise InputError(f"{self.store}: is a map; give new images, too")
+            if args.strategy_of(self.store) or self.robot_poses or self.scene:
+                raise InputError(
+                    f"{self.store}: give images that show a scene of a map, too, or a recording of"
+                    " the arm with joint values and no poses"
+                )
             return self._check_by_arm(reference)
         on_arm = reference.on_gripper and reference.joints
         if on_arm or self.urdf is not None or self.gripper_frame is not None:

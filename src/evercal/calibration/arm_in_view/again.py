@@ -1,6 +1,5 @@
 """`check` of a fixed camera by the arm in a few new images."""
 
-from evercal.calibration.arm_in_view.result import DOUBTFUL_CONFIRMED
 from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.drift import require_fixed
@@ -17,9 +16,6 @@ def calibrated_again(
     without = reference.source.get("without", ())
     start = reference.parent_from_child
     try:
-        near = calibrate_arm_in_view(recording, model, None, without, start)
-        if (near.checks.outline_confirmed or 0) > DOUBTFUL_CONFIRMED:
-            return near
+        return calibrate_arm_in_view(recording, model, None, without, start)
     except InputError:
-        pass
-    return calibrate_arm_in_view(recording, model, None, without)
+        return calibrate_arm_in_view(recording, model, None, without)
