@@ -23,7 +23,7 @@ from evercal.calibration.arm_in_view.starts import Overlap, starts
 from evercal.calibration.arm_in_view.views import ArmViews
 from evercal.calibration.calibration import Calibration
 from evercal.errors import InputError
-from evercal.geometry import SE3
+from evercal.geometry import SE3, spread
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame, Recording
 from evercal.robot.frame_names import FrameNames
@@ -188,8 +188,7 @@ def _best_start(
     overlap = Overlap(views, fitter.moving)
     poses = starts(overlap, fitter.reach_m())
     pose_only = replace(priors, pose_only=True)
-    few = np.linspace(0, len(views) - 1, min(SHORT_IMAGES, len(views)))
-    few = np.unique(few.round().astype(int))
+    few = spread(len(views), SHORT_IMAGES).tolist()
     reaches = [zoom * reach for reach in _SHORT_PX]
     best = None
     for number, pose in enumerate(poses):

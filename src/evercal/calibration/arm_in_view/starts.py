@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from evercal.calibration.arm_in_view.views import ArmViews
-from evercal.geometry import SE3, Camera, norms, unit_vectors
+from evercal.geometry import SE3, Camera, norms, spread, unit_vectors
 from evercal.typing import Array, BoolArray, Float32Array, Image, IntArray
 
 WIDTH_PX = 80
@@ -19,8 +19,8 @@ _DISTANCES = (0.6, 0.9, 1.4, 2.0, 2.8, 4.0)
 """In reaches of the arm."""
 _NEAREST = 0.25
 """Nearest point of the arm, in reaches."""
-_DRAWN = (600, 150, 12)
-"""Starts that are drawn in few images, in more images, and improved by random steps."""
+_DRAWN = (600, 150)
+"""Starts that are drawn in few images, and in more images."""
 _IMAGES = (4, 10)
 """Number of these images."""
 _DIRECTIONS = unit_vectors(
@@ -29,10 +29,8 @@ _DIRECTIONS = unit_vectors(
 _SHIFT = 4
 _PARTS = 2**_SHIFT
 """Parts of a pixel in which OpenCV draws."""
-_STEPS = 40
-"""Random steps."""
-_SPREAD = np.array([0.06, 0.06, 0.12, 0.12, 0.12, 0.12])
-"""Standard deviation of the first steps, reaches and radians."""
+_RETURNED = 12
+"""Starts that are returned."""
 
 
 class Overlap:
@@ -75,38 +73,18 @@ def _corners(vertices: Array) -> Array:
     return vertices[farthest]
 
 
-def starts(overlap: Overlap, reach_m: float, seed: int = 0) -> list[SE3]:
+def starts(overlap: Overlap, reach_m: float) -> list[SE3]:
     """camera_from_base of starts, the best first."""
     enough = overlap.masks.sum((1, 2))
     images = np.flatnonzero(enough > 0.3 * np.median(enough))
     candidates = _grid(overlap, images, reach_m)
     poses = [pose for _, pose in sorted(candidates, key=lambda item: item[0])]
-    for most, number in zip(_DRAWN, _IMAGES, strict=False):
-        some = _spread(images, number)
+    for most, number in zip(_DRAWN, _IMAGES, strict=True):
+        some = images[spread(len(images), number)]
         scored = [(overlap.score(pose, some), pose) for pose in poses[:most]]
         scored.sort(key=lambda item: -item[0])
         poses = [pose for _, pose in scored]
-    rng = np.random.default_rng(seed)
-    spread = _SPREAD * np.repeat([reach_m, 1.0], 3)
-    improved = []
-    for score, pose in scored[: _DRAWN[-1]]:
-        sigma = spread
-        for _ in range(_STEPS):
-            tried = SE3.exp(rng.normal(0, sigma)).matrix() @ pose
-            other = overlap.score(tried, some)
-            if other > score:
-                score = other
-                pose = tried
-            else:
-                sigma = sigma * 0.97
-        improved.append((score, pose))
-    improved.sort(key=lambda item: -item[0])
-    return [SE3.from_matrix(pose) for _, pose in improved]
-
-
-def _spread(images: IntArray, number: int) -> IntArray:
-    at = np.linspace(0, len(images) - 1, min(number, len(images)))
-    return images[at.round().astype(int)]
+    return [SE3.from_matrix(pose) for pose in poses[:_RETURNED]]
 
 
 def _grid(
