@@ -19,6 +19,7 @@ from benchmarks import eye_to_hand
 from benchmarks.accuracy import pose_error, wrong
 from benchmarks.arm_beside import beside
 from benchmarks.arm_faults import Cell, read_cell, spoil, write_cell
+from benchmarks.arm_parts import PARTS, without
 from benchmarks.rows import Row, grouped, median_of, numbers, save
 from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
 from evercal.errors import InputError
@@ -42,6 +43,8 @@ class Condition:
     size: float = 0.0
     """Of the fault: degrees, millimetres, a share, pixels."""
     first_seed: int = 0
+    left_out: str = ""
+    """A key of `benchmarks.arm_parts.PARTS`, or nothing."""
 
     def setting(self, seed: int) -> Setting:
         """The recording of a seed."""
@@ -89,6 +92,11 @@ WRONG = {
     name: Condition({}, 15, fault, size) for name, (fault, size) in SPOILED.items()
 }
 
+PARTS_LEFT = {
+    "all of it": Condition(),
+    **{part: Condition(left_out=part) for part in PARTS},
+}
+
 
 def _mass() -> dict[str, Condition]:
     """Cells of all arms, each with and without faults."""
@@ -112,6 +120,7 @@ WHAT = {
     "distances": DISTANCES,
     "arms": ARM_KINDS,
     "wrong": WRONG,
+    "parts": PARTS_LEFT,
     "mass": MASS,
     "beside": {},
 }
@@ -144,7 +153,9 @@ def run(
             if condition.fault:
                 rng = np.random.default_rng([setting.seed, 45])
                 spoil(cell, condition.fault, condition.size, rng)
-            rows.add(part, name, setting.seed, _solved(cell))
+            with without(condition.left_out):
+                row = _solved(cell)
+            rows.add(part, name, setting.seed, row)
         if part == "beside":
             _beside(rows, data, draws)
     for (part,), group in grouped(rows.rows, "part").items():

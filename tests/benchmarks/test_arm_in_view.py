@@ -3,7 +3,9 @@
 import pytest
 
 from benchmarks.arm_in_view import WHAT, Rows, summary
+from benchmarks.arm_parts import PARTS, without
 from benchmarks.rows import Row
+from evercal.calibration.arm_in_view import solve
 
 RIGHT: Row = {
     "condition": "a", "mm": 1.0, "deg": 0.02, "sigma_mm": 1.0, "sigma_deg": 0.02,
@@ -39,3 +41,11 @@ def test_the_mass_has_all_arms_and_faults_at_seeds_for_development() -> None:
     }
     assert len(WHAT["mass"]) == len(cells) * (1 + len(WHAT["wrong"]))
     assert all(name.startswith("drawn-") for name in cells)
+
+
+def test_a_part_is_left_out_for_one_calibration_only() -> None:
+    before = solve._LEARN_AT
+    with without("background learned once"):
+        assert solve._LEARN_AT == (0,)
+    assert before == solve._LEARN_AT
+    assert all(hasattr(solve, name) for name, _ in PARTS.values())
