@@ -102,6 +102,9 @@ def test_wrong_poses_are_found_named_and_repaired(run, data_set, tmp_path):
     again = run.json(*command)
     assert again == written
     assert [episode["seconds"] for episode in again["episodes"]] == seconds
+    # Other options have results of their own.
+    run(*command, "--most-mm", "40", "--images", "2")
+    assert len([*tmp_path.glob("*.rows")]) == 2
 
 
 @pytest.mark.parametrize(

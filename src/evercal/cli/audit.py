@@ -1,6 +1,7 @@
 """`evercal audit`."""
 
 import dataclasses
+import hashlib
 from collections import Counter
 from functools import partial
 from pathlib import Path
@@ -130,7 +131,12 @@ class Audit(args.Verb):
         with named_errors("--pose-convention", "convention"):
             audit.convention_of(())
         robot_body(model, (), without=self.without)  # refuses what is no robot
-        rows = self.out and self.out.with_suffix(".rows")
+        rows = None
+        if self.out is not None:  # other options have other results
+            asked = {**self.given, "workers": None, "ray": None, "json": None}
+            files = urdf.read_bytes(), self.camera.read_bytes()
+            digest = hashlib.sha256(repr((asked, files)).encode()).hexdigest()[:8]
+            rows = self.out.with_suffix(f".{digest}.rows")
         audited = audit_episodes(
             audit, episodes, rows, self.workers or cores(), self.ray
         )
