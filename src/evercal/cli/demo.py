@@ -2,11 +2,11 @@
 
 import shutil
 import tempfile
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING
 
 from evercal.classes import frozen
@@ -97,7 +97,7 @@ def run_demo(
     from evercal.reports.demo_page import DemoResult, demo_page
     from evercal.storage import MANIFEST, replace_folder, write_bytes
 
-    began = time.perf_counter()
+    began = perf_counter()
     store = out / STORE
     if store.exists() and not (store / MANIFEST).is_file():
         raise InputError(
@@ -129,7 +129,7 @@ def run_demo(
     for room in rooms:
         pictures += _pictures(cell, room.scene)
     write_image(out / QUERY, _spread(rooms[0].scene.test, 1)[0].read_image())
-    result.seconds = time.perf_counter() - began
+    result.seconds = perf_counter() - began
     write_bytes(out / REPORT, demo_page(result, pictures).encode())
     return result
 

@@ -1,11 +1,11 @@
 """`evercal localize`."""
 
 import math
-import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
+from time import perf_counter
 from typing import TYPE_CHECKING, Annotated
 
 from evercal.classes import frozen
@@ -100,9 +100,9 @@ class Localize(args.Verb):
 
         def answer(number: int) -> Answer:
             path = files[number]
-            began = time.perf_counter()
+            began = perf_counter()
             estimate = localize_picture(localizer, path, camera)
-            milliseconds = 1000 * (time.perf_counter() - began)
+            milliseconds = 1000 * (perf_counter() - began)
             known = unit_known(localizer, estimate.scene)
             if self.overlay and estimate.scene is not None:
                 image = read_image(path)

@@ -1,8 +1,8 @@
 """`evercal simulate`."""
 
 import re
-import time
 from dataclasses import replace
+from time import perf_counter
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
@@ -37,7 +37,7 @@ class Simulate(args.Verb):
         from evercal.simulation import cell_recording as cell
         from evercal.simulation.virtual_cell import CellOptions
 
-        began = time.perf_counter()
+        began = perf_counter()
         options = CellOptions()
         frames = cell.WRIST_IMAGES if self.frames is None else self.frames
         if self.size is not None:
@@ -53,7 +53,7 @@ class Simulate(args.Verb):
         with progress_bar("recording", images, "image") as bar:
             for _ in cell.record_cell(self.out, self.seed, frames, options):
                 bar.update()
-        seconds = time.perf_counter() - began
+        seconds = perf_counter() - began
         wrist = str(self.out / "wrist")
         record = {
             "scenes": [wrist],

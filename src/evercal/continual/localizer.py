@@ -1,9 +1,9 @@
 """Localization by networks: predicted scene coordinates and PnP."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import field, replace
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import torch
@@ -82,7 +82,7 @@ class NetworkLocalizer:
         patches. There are no `camera`, `terms` and `support`. The status is `failed` as well if the
         pose lies outside the cell of its scene.
         """
-        began = time.perf_counter()
+        began = perf_counter()
         image = as_rgb(image)
         scenes = self.contents
         cameras = _fitting_cameras(camera, image, scenes.scenes)
@@ -91,7 +91,7 @@ class NetworkLocalizer:
         scenes_tried = self._candidates(encoded, cameras)
         tried = [self._hypothesis(encoded, scene, cameras) for scene in scenes_tried]
         best = max(tried, key=_support)
-        return self._answer(best, 1000 * (time.perf_counter() - began))
+        return self._answer(best, 1000 * (perf_counter() - began))
 
     @property
     def _decides_scene(self) -> bool:

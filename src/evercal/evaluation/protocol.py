@@ -1,8 +1,8 @@
 """The evaluation protocol: test images of all scenes in random order, without their scene names."""
 
 import os
-import time
 from collections.abc import Callable, Mapping, Sequence
+from time import perf_counter
 
 import numpy as np
 
@@ -124,9 +124,9 @@ def _scene_tests(
 
 def _result(localizer: SceneLocalizer, test: _Test) -> FrameResult:
     frame = test.frame
-    start = time.perf_counter()
+    start = perf_counter()
     estimate = localizer.localize(frame.read_image(), frame.camera)
-    milliseconds = 1e3 * (time.perf_counter() - start)
+    milliseconds = 1e3 * (perf_counter() - start)
     metres = radians = np.inf
     squared = np.nan
     truth = frame.base_from_camera

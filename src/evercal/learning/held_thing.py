@@ -1,8 +1,8 @@
 """A fixed camera from images of a thing that the gripper holds, which becomes a scene."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
+from time import perf_counter
 
 from evercal.calibration.from_map.hand_eye import hand_eye_of
 from evercal.calibration.from_map.hand_eye_start import (
@@ -69,7 +69,7 @@ def learn_held_thing(
         on_progress: Called with the current step, how much of it is done, and its total.
         errors: What is known of the arm.
     """
-    began = time.perf_counter()
+    began = perf_counter()
     if not lacks_camera_poses(recording):
         require_frames(posed_recording(recording))
         raise InputError(

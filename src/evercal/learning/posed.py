@@ -1,8 +1,8 @@
 """A scene from frames with camera poses, stated or estimated: map, scatter and report."""
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
+from time import perf_counter
 
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
@@ -46,7 +46,7 @@ class LearnedScene:
             adjusted = replace(adjusted, **unknown)
         return LearnReport(
             scene=self.scene.name,
-            seconds=time.perf_counter() - began,
+            seconds=perf_counter() - began,
             memory_bytes=contents.with_scene(self.scene).memory_bytes,
             frames_kept=len(self.scene.keyframes),
             train_frames=len(self.split.train),

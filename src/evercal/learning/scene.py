@@ -1,6 +1,6 @@
 """A scene of a map from a recording: keyframes, landmarks, poses and their scatter."""
 
-import time
+from time import perf_counter
 
 from evercal.geometry import SE3
 from evercal.learning.posed import learn_posed, require_usable
@@ -36,7 +36,7 @@ def learn_scene(
         options: Sizes and priors of the map; `memory` overrides theirs.
         on_progress: Called with the current step, how much of it is done, and its total.
     """
-    began = time.perf_counter()
+    began = perf_counter()
     budget = MemoryBudget.parse(memory)
     options = options or MapOptions()
     require_usable(recording)

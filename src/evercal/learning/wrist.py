@@ -1,7 +1,7 @@
 """A scene from a camera on the gripper whose recording states gripper poses only."""
 
-import time
 from dataclasses import replace
+from time import perf_counter
 
 from evercal.calibration.from_map.hand_eye import hand_eye_of
 from evercal.calibration.from_map.hand_eye_start import (
@@ -40,7 +40,7 @@ def learn_wrist(
 
     `gripper_from_camera` is a rough one that the estimate is compared with.
     """
-    began = time.perf_counter()
+    began = perf_counter()
     posed, start = _posed_by_gripper(recording, contents, on_progress)
     split = split_held_out(posed.train)
     if len(split.held_out) < LEAST_ANSWERS:

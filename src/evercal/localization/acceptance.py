@@ -6,8 +6,8 @@ support of a pose is -log10 of the probability that a wrong one has as many inli
 accepted where that is below the rate of false accepts.
 """
 
-import math
 from functools import lru_cache
+from math import lgamma, log
 
 import numpy as np
 
@@ -48,14 +48,14 @@ def support(inliers: int, expected: int) -> float:
     relative = np.r_[0.0, relative]
     largest = relative.max()
     total = np.exp(relative - largest).sum()
-    tail = largest + math.log(total)
-    first = math.lgamma(n + 1)
-    first -= math.lgamma(k + 1)
-    first -= math.lgamma(n - k + 1)
+    tail = largest + log(total)
+    first = lgamma(n + 1)
+    first -= lgamma(k + 1)
+    first -= lgamma(n - k + 1)
     first += _log_beta(k + a, n - k + b)
     first -= _log_beta(a, b)
-    return max(0.0, -(first + tail) / math.log(10))
+    return max(0.0, -(first + tail) / log(10))
 
 
 def _log_beta(a: float, b: float) -> float:
-    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
+    return lgamma(a) + lgamma(b) - lgamma(a + b)

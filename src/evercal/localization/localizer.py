@@ -3,11 +3,11 @@
 The way of an image: prepare, encode, retrieve keyframes, match, PnP, align landmarks, accept.
 """
 
-import time
 from collections.abc import Iterable
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
 from typing import Self
 
 import numpy as np
@@ -110,7 +110,7 @@ class Localizer:
     def _located(
         self, image: Image, camera: Camera | None
     ) -> tuple[PoseEstimate, Hypothesis | None]:
-        began = time.perf_counter()
+        began = perf_counter()
         contents = self.contents
         query = self.query(image, camera)
         features = contents.encoder.encode(image, contents.short_side)
@@ -126,7 +126,7 @@ class Localizer:
                 other = InBase.of(contents.scenes[best.scene], rival)
             if not accepted(best, MIRRORED):
                 mirrored = self._mirrored_support(query)
-        milliseconds = 1000 * (time.perf_counter() - began)
+        milliseconds = 1000 * (perf_counter() - began)
         scene = contents.scenes[0 if best is None else best.scene]
         estimate = answer(best, scene, image.shape[:2], milliseconds, other, mirrored)
         return estimate, best

@@ -1,8 +1,8 @@
 """Refresh the map of a scene from new images of it: locate, compare, verify."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
+from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -92,7 +92,7 @@ def refresh_scene(
     The intrinsics of each image are by default those of the camera that recorded the scene. Too few
     located images, or a refreshed map that would locate fewer of them, raise `InputError`.
     """
-    began = time.perf_counter()
+    began = perf_counter()
     options = options or RefreshOptions()
     cameras = cameras or [None] * len(images)
     estimates = _estimates(localizer, images, cameras, on_progress)
@@ -122,7 +122,7 @@ def refresh_scene(
     millimetres, degrees = length_mm_deg(shift.tangent)
     report = RefreshReport(
         scene=scene.name,
-        seconds=time.perf_counter() - began,
+        seconds=perf_counter() - began,
         images=len(images),
         located=len(located),
         left_out=left_out,

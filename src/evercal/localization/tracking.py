@@ -8,10 +8,10 @@ from nothing, and so are those before repeated texture whose prediction leaves s
 Every n-th frame is located from nothing as well, and its pose replaces one that contradicts it.
 """
 
-import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
+from time import perf_counter
 from typing import Literal
 
 import numpy as np
@@ -148,7 +148,7 @@ class Tracker:
         if self.options.at_most_ms is None:
             estimate, state = self._located(image, stamp)
         else:
-            until = time.perf_counter() + self.options.at_most_ms / 1000
+            until = perf_counter() + self.options.at_most_ms / 1000
             estimate, state = self._located_in_time(image, stamp, until)
         smoothed, jumped = self._smooth(estimate, stamp)
         return TrackedFrame(
@@ -210,7 +210,7 @@ class Tracker:
         self, image: Image, stamp: float, until: float
     ) -> tuple[PoseEstimate, TrackState]:
         """The same until a time of the clock; what takes longer goes on in the background."""
-        began = time.perf_counter()
+        began = perf_counter()
         adopted = self._adopted(until)
         tracked = self._near_prediction(image, stamp)
         self._unchecked += 1
@@ -229,7 +229,7 @@ class Tracker:
             finished = self._finished(until - _ANSWER_S)
             if finished:
                 return self._relocalized(image, stamp, finished.future.result())
-        spent = 1000 * (time.perf_counter() - began)
+        spent = 1000 * (perf_counter() - began)
         searching = PoseEstimate.failed(_SEARCHING, spent)
         return replace(searching, omitted=("localization",)), "lost"
 
@@ -238,7 +238,7 @@ class Tracker:
         running = self._running
         if running is None:
             return None
-        if not wait([running.future], max(until - time.perf_counter(), 0.0)).done:
+        if not wait([running.future], max(until - perf_counter(), 0.0)).done:
             return None
         self._running = None
         return running
@@ -257,7 +257,7 @@ class Tracker:
 
     def _near_prediction(self, image: Image, stamp: float) -> PoseEstimate | None:
         """Follow the landmarks of the last image and align; None if that does not suffice."""
-        began = time.perf_counter()
+        began = perf_counter()
         predicted = self._predicted(stamp)
         if predicted is None or self._last is None:
             return None
@@ -274,12 +274,12 @@ class Tracker:
         seen = localizer.poses.bank.seen(self._scene, start, camera)
         candidate = Candidate(self._scene, seen[: localizer.options.keyframes])
         pose = localizer.poses.aligned(query, candidate, start, change, coarse=False)
-        self._alignment_s = time.perf_counter() - began
+        self._alignment_s = perf_counter() - began
         if pose is None or not self._trusted(pose, start, small):
             return None
         if self._may_have_slipped(pose, predicted, stamp):
             return None
-        milliseconds = 1000 * (time.perf_counter() - began)
+        milliseconds = 1000 * (perf_counter() - began)
         estimate = answer(pose, self._map, image.shape[:2], milliseconds)
         if estimate.status != "ok":  # too uncertain to be useful
             return None

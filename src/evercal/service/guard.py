@@ -2,9 +2,9 @@
 
 import asyncio
 import hmac
-import time
 from collections.abc import Awaitable, Callable, Iterable, MutableMapping
 from contextlib import suppress
+from time import perf_counter
 from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
@@ -75,14 +75,14 @@ class _Body:
         self._receive = receive
         self._limits = limits
         self._bodies = bodies
-        self._began = time.perf_counter()
+        self._began = perf_counter()
 
     async def part(self) -> Message:
         """The next message; after the last part the end of the connection."""
         seconds = None
         if not self.ended:
             limits = self._limits
-            passed = time.perf_counter() - self._began
+            passed = perf_counter() - self._began
             allowed = limits.wait_s + self.arrived / limits.bytes_per_s
             seconds = min(limits.wait_s, max(allowed - passed, 0.0))
         try:
@@ -149,7 +149,7 @@ class Guard:
         app = self._app
         if refusal:
             app = _refused(*refusal)
-        began = time.perf_counter()
+        began = perf_counter()
         status = 0
         body = _Body(receive, self._limits, self._bodies)
 
@@ -179,7 +179,7 @@ class Guard:
             if method not in _METHODS:
                 method = "other"
             self._metrics.requests.labels(method, route, status or 500).inc()
-            self._metrics.seconds.labels(route).observe(time.perf_counter() - began)
+            self._metrics.seconds.labels(route).observe(perf_counter() - began)
 
     async def _stream(
         self,

@@ -3,8 +3,8 @@
 Tables 1 to 3 have scenes down and strategies across. Table 4 adds SARS, then SPDD.
 """
 
-import math
 from collections.abc import Mapping
+from math import isinf, nan
 
 import pandas as pd
 
@@ -45,23 +45,23 @@ TABLE4 = (
 """Strategies of `ABLATIONS`."""
 PUBLISHED: Mapping[str, Mapping[str, Pair]] = {
     "i7s": {
-        "joint": (81.7, math.nan),
-        "finetune": (1.1, math.nan),
+        "joint": (81.7, nan),
+        "finetune": (1.1, nan),
         "icarl": (65.2, 11.37),
         "buff_cs": (66.1, 13.03),
         "gec": (26.5, 62.67),
         "gdr": (59.6, 12.25),
-        "sars_old_output": (72.0, math.nan),
+        "sars_old_output": (72.0, nan),
         "sars_spdd": (74.9, 6.65),
     },
     "i12s": {
-        "joint": (96.9, math.nan),
-        "finetune": (6.2, math.nan),
+        "joint": (96.9, nan),
+        "finetune": (6.2, nan),
         "icarl": (66.0, 33.3),
         "buff_cs": (83.1, 15.7),
         "gec": (13.5, 88.9),
         "gdr": (78.7, 21.9),
-        "sars_old_output": (90.9, math.nan),
+        "sars_old_output": (90.9, nan),
         "sars_spdd": (91.8, 8.1),
     },
 }
@@ -101,9 +101,9 @@ def paper_table(results: Table, suite: str = "") -> Table:
         if len(values):
             totals[f"{title}, published"] = dict(values)
     for title, values in totals.items():
-        table.loc[title] = math.nan
+        table.loc[title] = nan
         for name in names:
-            table.loc[title, (name, "Acc, %")] = values.get(name, math.nan)
+            table.loc[title, (name, "Acc, %")] = values.get(name, nan)
     table.index.name = None
     return table.rename_axis(columns=[None, None])
 
@@ -145,7 +145,7 @@ def latex(table: Table, index: bool = True) -> str:
     """Format a table in LaTeX (needs booktabs); NaN becomes `--`."""
 
     def text(value: float) -> str:
-        if math.isinf(value):
+        if isinf(value):
             return r"$\infty$"
         return f"{value:.1f}"
 

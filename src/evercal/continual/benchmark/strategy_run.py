@@ -1,11 +1,11 @@
 """One run: a strategy with a seed over a sequence of scenes, resumed where it was interrupted."""
 
 import shutil
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from functools import cache
 from pathlib import Path
+from time import perf_counter
 from typing import Literal
 
 import pandas as pd
@@ -201,11 +201,11 @@ class _NetworkRun(_Run):
             split = split_held_out(scene.train)
             recordings.append(replace(scene, train=split.train))
             held_out.append(split.held_out)
-        began = time.perf_counter()
+        began = perf_counter()
         learned = learn_jointly(empty, recordings, self.stage)
         for number, frames in enumerate(held_out):
             learned.scenes[number] = fit_threshold(learned, frames, number)
-        seconds = time.perf_counter() - began
+        seconds = perf_counter() - began
         last = len(self.scenes) - 1
         nothing = pd.DataFrame()
         for number in range(last):
@@ -248,7 +248,7 @@ class _NetworkRun(_Run):
             if not is_store(shared) or not NetworkStore.open(shared).stages:
                 self._learn(shared, scene, STRATEGIES["finetune"])
         first = NetworkStore.open(shared)
-        began = time.perf_counter()
+        began = perf_counter()
         scenes = self._prepared(first.contents.copy_for_training())
         scenes.strategy = self.strategy.name
         scenes.keyframes = []
@@ -264,7 +264,7 @@ class _NetworkRun(_Run):
 
         finish_scene(scenes, method, train, rows, self.stage)
         report = first.reports()[-1]
-        report["seconds"] = float(report["seconds"]) + time.perf_counter() - began
+        report["seconds"] = float(report["seconds"]) + perf_counter() - began
         report["frames_kept"] = scenes.frames_kept
         self._new_store().commit(scenes, report)
 

@@ -1,9 +1,9 @@
 """`learn_networks`: what the command line calls to learn a scene into a store of networks."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
 
 from evercal.classes import frozen
 from evercal.continual.learning.learn import learn
@@ -125,7 +125,7 @@ def learn_networks(
         options: strategy and amount of training.
         on_event: called with every event, for progress bars.
     """
-    began = time.perf_counter()
+    began = perf_counter()
     stage = options.stage_options()
     strategy = options.strategy
     if isinstance(strategy, str):
@@ -157,7 +157,7 @@ def learn_networks(
         learned.scenes[-1] = fit_threshold(learned, split.held_out)
         report = NetworkReport(
             scene=recording.name,
-            seconds=time.perf_counter() - began,
+            seconds=perf_counter() - began,
             memory_bytes=learned.memory_bytes,
             frames_kept=learned.frames_kept,
             train_frames=len(split.train),
