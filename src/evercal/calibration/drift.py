@@ -5,7 +5,7 @@ shift is more accurate than either pose: to the scatter of the images, and a flo
 light and of objects in view.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -30,7 +30,7 @@ from evercal.calibration.located import (
 )
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, axis_deviation, deviations, length_mm_deg
-from evercal.recordings.images import Picture
+from evercal.recordings.images import NamedPictures
 from evercal.typing import Array
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class Shift:
 
 def check(
     localizer: "Localizer",
-    images: Sequence[tuple[str, Picture]],
+    images: NamedPictures,
     reference: Calibration,
     camera: Camera | None = None,
     on_image: Callable[[], object] = lambda: None,

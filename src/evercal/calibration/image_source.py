@@ -11,7 +11,7 @@ from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.image_files import image_files
-from evercal.recordings.images import Picture, as_rgb
+from evercal.recordings.images import NamedPictures, as_rgb
 from evercal.recordings.poses.pairing import poses_of_images
 from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.typing import PathLike, Strings
@@ -24,7 +24,7 @@ ImageSource = PathLike | np.ndarray | Sequence[PathLike] | Sequence[np.ndarray]
 class Images:
     """Images of one camera, with intrinsics and gripper poses if known."""
 
-    images: Sequence[tuple[str, Picture]]
+    images: NamedPictures
     """Names and pictures, which are read one at a time."""
     camera: Camera | None = None
     """Intrinsics. None: those of the camera that recorded the scene, or of another of its model."""

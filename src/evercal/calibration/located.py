@@ -22,7 +22,7 @@ from evercal.geometry import (
 from evercal.geometry.rays import fit_rays
 from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.localization.pictures import localize_picture
-from evercal.recordings.images import Picture
+from evercal.recordings.images import NamedPictures
 from evercal.typing import Array, BoolArray, Pair
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def mean_covariance(items: Sequence[ImagePose]) -> Array:
 
 def locate(
     localizer: "Localizer",
-    images: Sequence[tuple[str, Picture]],
+    images: NamedPictures,
     camera: Camera | None = None,
     on_image: Callable[[], object] = lambda: None,
 ) -> list[ImagePose]:

@@ -42,7 +42,7 @@ from evercal.storage.stages import (
     write_report,
 )
 from evercal.storage.tensors import load_tensors, save_tensors
-from evercal.typing import JsonObject, Strings
+from evercal.typing import JsonObject, Record, Strings
 
 HEAD = "head.safetensors"
 """File of the weights of a head."""
@@ -118,7 +118,7 @@ class NetworkStore(StageStore[LearnedScenes]):
         if listed(HEAD):
             scenes.heads.append(_read_head(folder, scenes.encoder.width))
 
-    def commit(self, scenes: LearnedScenes, report: Mapping[str, object]) -> None:
+    def commit(self, scenes: LearnedScenes, report: Record) -> None:
         """Add the newest scene of `scenes`: whole, or not at all."""
         record = scenes.scenes[-1]
         keyframes = scenes.keyframes[-1]

@@ -10,7 +10,6 @@ pixel, as in OpenCV and ROS, so an image covers -0.5 .. width - 0.5 and its midd
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any, Self
@@ -27,7 +26,7 @@ from evercal.geometry.distortion import (
     widest_fisheye,
     widest_pinhole,
 )
-from evercal.typing import Array, ArrayPair, Floats, JsonObject, Size, Strings
+from evercal.typing import Array, ArrayPair, Floats, JsonObject, Record, Size, Strings
 
 COEFFICIENTS: dict[str, Strings] = {
     "pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
@@ -310,7 +309,7 @@ class Camera:
         return values
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, object]) -> Self:
+    def from_dict(cls, data: Record) -> Self:
         """Inverse of `to_dict`; unknown keys are ignored, `distortion` is optional."""
         numbers: JsonObject = {}
         for name in ("width", "height", "fx", "fy", "cx", "cy"):

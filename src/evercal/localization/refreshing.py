@@ -19,7 +19,7 @@ from evercal.mapping.scene_map import SceneMap
 from evercal.mapping.selection import spread_poses
 from evercal.progress import OnProgress
 from evercal.recordings.frame import Frame
-from evercal.recordings.images import Picture
+from evercal.recordings.images import NamedPictures
 from evercal.typing import Array
 
 LEAST_IMAGES = 5
@@ -82,7 +82,7 @@ class NewImage(NamedTuple):
 
 def refresh_scene(
     localizer: Localizer,
-    images: Sequence[tuple[str, Picture]],
+    images: NamedPictures,
     cameras: Sequence[Camera | None] | None = None,
     options: RefreshOptions | None = None,
     on_progress: OnProgress = lambda *_: None,
@@ -142,7 +142,7 @@ def refresh_scene(
 
 def _estimates(
     localizer: Localizer,
-    images: Sequence[tuple[str, Picture]],
+    images: NamedPictures,
     cameras: Sequence[Camera | None],
     on_progress: OnProgress,
 ) -> list[PoseEstimate]:
@@ -162,7 +162,7 @@ def _shown_scene(localizer: Localizer, estimates: Sequence[PoseEstimate]) -> int
 
 
 def _usable(
-    images: Sequence[tuple[str, Picture]],
+    images: NamedPictures,
     cameras: Sequence[Camera | None],
     estimates: Sequence[PoseEstimate],
     scene: SceneMap,

@@ -9,7 +9,7 @@ stages/0001-NAME/
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Self
@@ -51,7 +51,7 @@ from evercal.storage.stages import (
 )
 from evercal.storage.tensors import load_tensors, open_tensors, save_tensors
 from evercal.storage.text_files import named_errors, refuse_repeated
-from evercal.typing import JsonObject
+from evercal.typing import JsonObject, Record
 
 KIND = "map"
 """Kind of store in its manifest."""
@@ -127,7 +127,7 @@ class MapStore(StageStore[MapContents]):
         return cls.open(root, encoder)
 
     def commit(
-        self, scene: SceneMap, report: Mapping[str, object], replaced: str | None = None
+        self, scene: SceneMap, report: Record, replaced: str | None = None
     ) -> None:
         """Add a scene, in the place of one that is removed or of none: whole, or not at all."""
         names = self.contents.names
@@ -166,7 +166,7 @@ class MapStore(StageStore[MapContents]):
 
         self._exchange(scene, write)
 
-    def refresh(self, scene: SceneMap, report: Mapping[str, object]) -> None:
+    def refresh(self, scene: SceneMap, report: Record) -> None:
         """Replace a scene of the same name by its refreshed map: whole, or not at all.
 
         The state before is kept for `undo`.

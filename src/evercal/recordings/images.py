@@ -61,6 +61,8 @@ class UnturnedImage(StoredImage):
 
 Picture = Path | Image | StoredImage
 """A file, an array that `as_rgb` accepts, or an image inside a bag or video."""
+NamedPictures = Sequence[tuple[str, Picture]]
+"""Pictures with their names."""
 
 
 def pixels_of(image: Picture) -> Image:

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evercal.classes import frozen_arrays
-from evercal.typing import JsonObject
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import ErrorTerm
@@ -32,7 +31,7 @@ def unit_known(localizer: "LearnedLocalizer", name: str | None) -> bool:
     return all(getattr(scene, "metric", True) for scene in scenes)
 
 
-def answer_row(answer: Answer) -> JsonObject:
+def answer_row(answer: Answer) -> dict[str, object]:
     """The row of `evercal localize --json` for one image; null without a pose.
 
     Where the unit of length is unknown, lengths are in that unit and there are no millimetres.
@@ -91,7 +90,7 @@ def budget_of(estimate: "PoseEstimate") -> "list[tuple[ErrorTerm, float]]":
     return list(zip(terms, position_shares(terms), strict=True))
 
 
-def shift_dict(shift: "Shift") -> JsonObject:
+def shift_dict(shift: "Shift") -> dict[str, object]:
     """The shift of a camera as JSON values."""
     return {
         "moved": shift.moved,
@@ -106,7 +105,7 @@ def shift_dict(shift: "Shift") -> JsonObject:
     }
 
 
-def check_record(shift: "Shift") -> JsonObject:
+def check_record(shift: "Shift") -> dict[str, object]:
     """The object of `evercal check --json`: the shift, and the images that were left out."""
     rejected = [vars(use) for use in shift.images if not use.used]
     return {**shift_dict(shift), "images": len(shift.images), "left_out": rejected}

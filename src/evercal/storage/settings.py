@@ -1,15 +1,14 @@
 """Settings of a run, stored in its folder of results."""
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.storage.atomic import write_json
-from evercal.typing import JsonObject
+from evercal.typing import JsonObject, Record
 
 
-def lock_settings(path: Path, settings: Mapping[str, object]) -> None:
+def lock_settings(path: Path, settings: Record) -> None:
     """Store the settings of a run that can be resumed; refuse a folder with other settings.
 
     The file is created if it is missing. Settings are JSON values, compared key by key.

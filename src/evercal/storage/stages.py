@@ -28,7 +28,7 @@ from evercal.errors import InputError
 from evercal.storage.atomic import replace_folder, write_json
 from evercal.storage.manifest import MANIFEST, Manifest, write_manifest
 from evercal.storage.text_files import is_link, read_json
-from evercal.typing import JsonObject
+from evercal.typing import JsonObject, Record
 
 SCHEMA = 6
 """Version of the files of a store."""
@@ -49,7 +49,7 @@ _MADE = "made"
 Result = TypeVar("Result")
 Contents = TypeVar("Contents")
 Names = Sequence[str]
-Payload = Mapping[str, object]
+Payload = Record
 """Settings of a store, or a report."""
 Superseded = Callable[[str], bool]
 """Whether a file of a kept stage, by its name, is dropped."""

@@ -25,7 +25,7 @@ from evercal.geometry import SE3, Camera, axis_deviation, cross_matrix
 from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.mapping.map_frame import MapFrame, Similarity
 from evercal.mapping.scene_map import SceneMap
-from evercal.recordings.images import Picture
+from evercal.recordings.images import NamedPictures
 from evercal.storage.text_files import few
 from evercal.typing import Array, ArrayPair, Image, Pair, Strings
 
@@ -80,7 +80,7 @@ def _in_own_frame(localizer: "Localizer", name: str) -> "Localizer":
 def align_by_gripper(
     localizer: "Localizer",
     scene: str,
-    images: Sequence[tuple[str, Picture]],
+    images: NamedPictures,
     base_from_gripper: SE3,
     scale_known: bool = True,
     camera_from_board: Mapping[str, SE3] | None = None,
@@ -136,7 +136,7 @@ def align_by_gripper(
 def _located_in(
     localizer: "Localizer",
     scene: str,
-    images: Sequence[tuple[str, Picture]],
+    images: NamedPictures,
     camera_from_board: Mapping[str, SE3] | None,
 ) -> tuple[list[int], list[ImagePose]]:
     """Rows of the images that are located in a scene, and their poses, or those of the boards."""

@@ -44,7 +44,7 @@ from evercal.mapping.store import MapStore
 from evercal.recordings import Recording, stated_poses
 from evercal.recordings.held_out import split_held_out
 from evercal.storage.stages import is_store
-from evercal.typing import JsonObject
+from evercal.typing import JsonObject, Record
 
 NETWORK_LOCALIZE = NetworkLocalizeOptions(refuses=False)
 """Networks answer for every image, as published methods do. A refusal rule would favour methods
@@ -122,7 +122,7 @@ class _Run:
         self,
         localizers: Mapping[str, SceneLocalizer],
         number: int,
-        costs: Mapping[str, object],
+        costs: Record,
     ) -> StageResults:
         """Evaluate all scenes learned so far by localizers, by the names of their results."""
         results = []

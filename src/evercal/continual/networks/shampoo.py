@@ -1,9 +1,11 @@
 """One-sided Shampoo, the optimiser of the head's hidden matrices."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
+
+from evercal.typing import Record
 
 MOMENTUM = 0.95
 """Decay of the running mean of gradients per step."""
@@ -27,9 +29,7 @@ class OneSidedShampoo(torch.optim.Optimizer):
     singular values by about the rate; the decoupled weight decay is relative to it.
     """
 
-    def __init__(
-        self, groups: Iterable[Mapping[str, object]], rate: float, weight_decay: float
-    ):
+    def __init__(self, groups: Iterable[Record], rate: float, weight_decay: float):
         super().__init__(map(dict, groups), {"lr": rate, "weight_decay": weight_decay})
 
     @torch.no_grad()

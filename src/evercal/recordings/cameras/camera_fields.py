@@ -227,7 +227,7 @@ def _distortion(fields: Fields, model: str) -> Floats | None:
     return tuple(numbers)
 
 
-def _refuse_other_models(models: Mapping[str, object], distortion: Floats) -> None:
+def _refuse_other_models(models: Record, distortion: Floats) -> None:
     """Refuse models other than OpenCV's, which `none` and `zero` are without coefficients."""
     for kind, model in models.items():
         if kind in ("brown", "fisheye"):

@@ -9,7 +9,6 @@ frames. (Tancik et al., Nerfstudio, SIGGRAPH 2023; its documentation, Data conve
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 from typing import Any, TypeAlias
@@ -36,7 +35,7 @@ from evercal.storage.text_files import (
     read_json,
     refuse_repeated,
 )
-from evercal.typing import Array
+from evercal.typing import Array, Record
 
 FILE = "transforms.json"
 """Usual name of the file."""
@@ -57,7 +56,7 @@ _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Numbers of `distortion_params`, in this order."""
 _TOLERANCE = 1e-2
 """Largest deviation of a stated matrix from a rotation."""
-Entry: TypeAlias = Mapping[str, object]
+Entry: TypeAlias = Record
 """Values of the file."""
 Size: TypeAlias = tuple[int, int]
 """Width and height, pixels."""
