@@ -155,7 +155,7 @@ def _rays(
 ) -> tuple[Array, Array, FramedPose]:
     """Rays (m, 3) of both in camera frames, and the second one for the lens of the first."""
     lens = first.camera or second.camera
-    if lens is None:
+    if not lens:
         notes.append("neither states intrinsics: frames are compared, not rays")
         axis = np.array([[0.0, 0.0, 1.0]])
         return axis, axis, second

@@ -109,7 +109,7 @@ class FramedPose:
     def lens_in_words(self) -> str:
         """The intrinsics that the pose belongs to; empty without any."""
         own = self.camera
-        if own is None:
+        if not own:
             return ""
         numbers = f"fx {own.fx:.3f} fy {own.fy:.3f} cx {own.cx:.3f} cy {own.cy:.3f} px"
         if own.distortion:
@@ -150,7 +150,7 @@ class FramedPose:
             raise InputError(f"`lens` {lens}: this calibration has {known}")
         else:
             lens = lenses[lens]
-        if self.camera is None:
+        if not self.camera:
             raise InputError("`lens`: this calibration holds no intrinsics")
         try:
             turn = fit_rays(self.camera, lens).own_from_other
@@ -182,5 +182,5 @@ class FramedPose:
             "matrix": self.parent_from_child.matrix().tolist(),
             "covariance": self.covariance.tolist(),
             "lens": self.lens,
-            "camera": None if self.camera is None else self.camera.to_dict(),
+            "camera": self.camera.to_dict() if self.camera else None,
         }

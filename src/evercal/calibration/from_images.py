@@ -93,7 +93,7 @@ def calibrate(
         "command": "calibrate",
         "scene": fused.scene,
         "map": scene.digest,
-        "intrinsics": "map" if given.camera is None else "given",
+        "intrinsics": "given" if given.camera else "map",
     }
     height, width = first.shape[:2]
     stated = cameras_in_scenes(given.camera, first, [scene])[0]
@@ -108,7 +108,7 @@ def calibrate(
     if grip:
         camera = lenses["estimated"]
         return _held_thing_calibration(grip, view, camera, source)
-    if view.parent_from_scene is None:
+    if not view.parent_from_scene:
         uncertainty = from_one_spot(view.in_parent, fused)
     else:
         uncertainty = from_many_spots(
@@ -136,7 +136,7 @@ def calibrate(
 
 def _stated_mount(mount: MountName | None, given: Images) -> Mount | None:
     stated = None if mount is None else mount_named(mount)
-    if stated == EYE_IN_HAND and given.base_from_gripper is None:
+    if stated == EYE_IN_HAND and not given.base_from_gripper:
         raise InputError(
             "eye_in_hand needs the gripper's pose at every image: give `robot_poses`"
         )
@@ -156,9 +156,9 @@ def _view(
         raise InputError(
             "eye_in_hand: the gripper holds the scene, which shows fixed cameras only"
         )
-    if mount is None:
+    if not mount:
         mount = EYE_IN_HAND
-        if held or grippers is None or _stands_still(located):
+        if held or not grippers or _stands_still(located):
             mount = EYE_TO_HAND
     parent_from_scene = None
     in_parent = located
@@ -195,7 +195,7 @@ def _names(given: Images, scene: "SceneMap", held: bool) -> FrameNames:
     role = "gripper" if held else "base"
     own = FrameNames(**{role: vars(scene.frames)[role]})
     names = own.completed_by(given.frames, f"scene {scene.name}")
-    if given.base_from_gripper is None:
+    if not given.base_from_gripper:
         names = replace(names.or_of(scene.frames), camera=names.camera)
     return names
 

@@ -103,7 +103,7 @@ def locate(
         estimate = localize_picture(localizer, image, camera)
         uncertain = estimate.uncertain_pose
         own = estimate.camera
-        if uncertain is None or estimate.scene is None:
+        if not uncertain or estimate.scene is None:
             uncertain = UncertainPose(SE3.identity(), np.eye(6))
         else:
             base = contents.base_of(estimate.scene)
@@ -157,7 +157,7 @@ def shows_held_thing(
     """Whether the first located image shows a thing in the gripper, which needs gripper poses."""
     name = next((item.estimate.scene for item in located if item.is_located), None)
     held = name is not None and localizer.contents.scene(name).parent_frame == "gripper"
-    if held and base_from_gripper is None:
+    if held and not base_from_gripper:
         raise InputError(
             f"scene {name} is a thing in the gripper: give the gripper's pose at every image with"
             " `robot_poses`"

@@ -34,7 +34,7 @@ def made_again(file: Path, old: "Calibration") -> str:
     verb: Any = None
     if made and _MAKERS & {*made.command[1:2]}:
         verb = parsed([*map(os.path.expanduser, made.command[1:])])
-    if made is None or not hasattr(verb, "writes"):
+    if not made or not hasattr(verb, "writes"):
         raise InputError(
             f"{file}: records {made or 'nothing, as files before evercal 0.3'}; make it anew and"
             " give the old file with --against"

@@ -98,7 +98,7 @@ class Align(args.Verb):
         from evercal.calibration.picked_points import read_picks, read_points
         from evercal.recordings import read_image
 
-        if self.points is None or self.picks is None:
+        if not self.points or not self.picks:
             raise InputError("--points and --picks belong together; give both")
         points = read_points(self.points)
         by_image: dict[str, dict[str, np.ndarray]] = {}

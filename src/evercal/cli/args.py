@@ -262,7 +262,7 @@ def camera_for(file: Path | None, images: Sequence[Path]) -> "Camera | None":
     """The camera in the file of --camera, for the size of the first readable image."""
     from evercal.recordings.images import first_size
 
-    if file is None:
+    if not file:
         return None
     return stated_camera(file, first_size(images))
 
@@ -271,14 +271,14 @@ def stated_camera(file: Path | None, size: tuple[int, int]) -> "Camera | None":
     """The camera in the file of --camera, for images of (width, height)."""
     from evercal.recordings.cameras.camera_file import read_camera
 
-    if file is None:
+    if not file:
         return None
     return read_camera(file, size)
 
 
 def transform_of(file: Path | None) -> "SE3 | None":
     """The transform in a file of --gripper-from-camera or --calibration."""
-    if file is None:
+    if not file:
         return None
     from evercal.calibration.transform_file import read_transform
 

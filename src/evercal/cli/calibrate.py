@@ -138,7 +138,7 @@ def at_record(
     calibration: "Calibration", point: args.Point | None
 ) -> dict[str, object]:
     """The entry of --at in the JSON answer; empty without a point."""
-    if point is None:
+    if not point:
         return {}
     return {"at": point.record(calibration.uncertain_pose)}
 

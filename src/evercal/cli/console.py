@@ -65,7 +65,7 @@ def size(count: float) -> str:
 
 def require_writable(path: Path | None, option: str) -> None:
     """Refuse an output file that cannot be written, before any work is done."""
-    if path is None:
+    if not path:
         return
     folder = path.resolve().parent
     if path.is_dir():
@@ -80,7 +80,7 @@ def require_writable(path: Path | None, option: str) -> None:
 
 def require_folder(path: Path | None, option: str) -> None:
     """Create an output folder, before any work is done."""
-    if path is None:
+    if not path:
         return
     try:
         path.mkdir(parents=True, exist_ok=True)

@@ -104,7 +104,7 @@ class Detect(args.Verb):
             )
         board, views = self._detected(files, board, width, height)
         detected = [view for view in views.values() if isinstance(view, BoardView)]
-        if camera is None:
+        if not camera:
             camera = calibrate_camera(detected, width, height, self.lens).camera
             source = "board"
         poses = board_poses(board, camera, views, source)
@@ -140,7 +140,7 @@ class Detect(args.Verb):
             )
         dictionary = self.dictionary or _DICTIONARIES[self.board]
         match = re.fullmatch(r"(\d+)[xX,](\d+)", self.size or "0x0")
-        if match is None:
+        if not match:
             raise InputError(f"--size {self.size}: give two numbers such as 9x6")
         return Board(
             kind=self.board,
@@ -186,7 +186,7 @@ class Detect(args.Verb):
 
 def _lines(poses: "BoardPoses", warning: str) -> Iterator[str]:
     for image in poses.images:
-        if image.camera_from_board is None:
+        if not image.camera_from_board:
             yield f"{image.name}: {image.reason}"
             continue
         position = numbers(1000 * image.camera_from_board.translation_m, "+.1f")

@@ -73,7 +73,7 @@ class Export(args.Verb):
         from evercal.calibration.export.request import ExportOptions, prepare_export
         from evercal.calibration.learned import calibration_at
 
-        if self.format == "list" or (self.format is None and self.calibration is None):
+        if self.format == "list" or (self.format is None and not self.calibration):
             file = self.calibration or "CALIBRATION.json"
             formats = {name: row.description for name, row in FORMATS.items()}
             self.answer(
@@ -86,7 +86,7 @@ class Export(args.Verb):
             raise InputError(
                 f"no format given; add --format NAME, one of {', '.join(FORMATS)}, or --publish"
             )
-        if self.calibration is None:
+        if not self.calibration:
             raise InputError("no calibration given; name its JSON file after 'export'")
         options = {key: getattr(self, key) for key in ExportOptions.__annotations__}
         calibration = calibration_at(self.calibration)
@@ -122,7 +122,7 @@ class Export(args.Verb):
             )
         if calibration.lens:
             say(f"note: the pose is for {calibration.lens_in_words}", sys.stderr)
-        if self.out is None and not self.json:
+        if not self.out and not self.json:
             sys.stdout.write(printable(exported.text))
             return
         record = {

@@ -82,7 +82,7 @@ class Localize(args.Verb):
             then = ("localize", self.store, files[0], "--scene", scene)
         elif not located:
             then = ("learn", self.store, "RECORDING")
-        elif self.overlay is None:
+        elif not self.overlay:
             then = ("localize", self.store, files[0], "--overlay", "DIR")
         else:
             then = ("evaluate", self.store, "RECORDING")
@@ -169,7 +169,7 @@ def _lines(answer: Answer, point: args.Point | None) -> Iterator[str]:
         note = " (a thing in the gripper: the pose is gripper_from_camera)"
     if estimate.scene is not None:
         yield f"  scene        {estimate.scene_in_words}{note}"
-    if pose is None:
+    if not pose:
         yield f"  {estimate.status.replace('_', ' ')}: {estimate.reason}"
         yield inliers
         return

@@ -61,7 +61,7 @@ class Record(args.Verb):
             size = (image.shape[1], image.shape[0])
             stated = args.stated_camera(self.intrinsics, size)
             intrinsics = stated or camera.intrinsics()
-            if intrinsics is None:
+            if not intrinsics:
                 raise InputError(
                     f"no --intrinsics FILE given, and {self.source} states none"
                 )

@@ -42,7 +42,7 @@ class Simulate(args.Verb):
         frames = cell.WRIST_IMAGES if self.frames is None else self.frames
         if self.size is not None:
             size = re.fullmatch(r"(\d+)x(\d+)", self.size)
-            if size is None:
+            if not size:
                 raise InputError(
                     f"--size {self.size}: give WIDTHxHEIGHT in pixels, such as 640x480"
                 )

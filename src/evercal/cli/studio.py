@@ -99,7 +99,7 @@ class Studio(PageVerb):
             missing = ""
             if self.camera is None and self.fixed is None:
                 missing = "--camera SOURCE"
-            elif self.poses is None:
+            elif not self.poses:
                 missing = "--poses FILE"
             if missing:
                 raise InputError(
@@ -148,12 +148,12 @@ class Studio(PageVerb):
         fixed = None if self.fixed is None else open_camera(self.fixed)
         intrinsics = self.intrinsics
         begun = self.out / "wrist" / "camera.json"
-        if intrinsics is None and self.camera is None:
+        if not intrinsics and self.camera is None:
             intrinsics = fixed_intrinsics
-        elif intrinsics is None and begun.is_file():
+        elif not intrinsics and begun.is_file():
             intrinsics = begun
         camera = _intrinsics(intrinsics, wrist or fixed)
-        if camera is None:
+        if not camera:
             raise InputError(
                 "no --intrinsics FILE given: a new recording needs the intrinsics"
             )
@@ -178,6 +178,6 @@ class Studio(PageVerb):
 def _intrinsics(file: Path | None, camera: "StreamCamera | None") -> "Camera | None":
     from evercal.recordings.cameras.camera_file import read_camera
 
-    if file is None:
+    if not file:
         return camera and camera.intrinsics()
     return read_camera(file)

@@ -80,7 +80,7 @@ class Track(args.Verb):
             files = [stack.enter_context(TrackFile(path)) for path in self.out]
             try:
                 for name, stamp, image, _ in frames:
-                    if tracker is None:
+                    if not tracker:
                         size = (image.shape[1], image.shape[0])
                         camera = args.stated_camera(self.camera, size)
                         camera = camera or source.intrinsics()
@@ -141,7 +141,7 @@ class Track(args.Verb):
 
 def _line(name: str, frame: "TrackedFrame", unit_known: bool) -> str:
     estimate = frame.estimate
-    if frame.state == "lost" or estimate.base_from_camera is None:
+    if frame.state == "lost" or not estimate.base_from_camera:
         return f"{name}: lost ({estimate.reason or estimate.status})"
     position = estimate.base_from_camera.translation_m
     pose = estimate.uncertain_pose

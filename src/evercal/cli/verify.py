@@ -129,7 +129,7 @@ class Verify(args.Verb):
         sigma_m = self.touch_mm / 1000
         if self.points:
             return touched_tips(read_points(self.points), sigma_m)
-        if self.touches is None:
+        if not self.touches:
             raise InputError("--picks: give --points or --touches of these points")
         rows = read_robot_poses(self.touches, self.convention, option="`convention`")
         if rows.names is None:
@@ -149,7 +149,7 @@ class Verify(args.Verb):
     def _grippers(self, images: "dict[str, Path]") -> "dict[str, SE3]":
         from evercal.recordings.poses.pairing import poses_of_images
 
-        if self.robot_poses is None:
+        if not self.robot_poses:
             return {}
         files = [*images.values()]
         poses, notes = poses_of_images(self.robot_poses, files, self.convention)
@@ -184,7 +184,7 @@ class Verify(args.Verb):
             _require_size(calibration, boards.camera.size)
             target = board_target(boards)
             return target, self._grippers({name: Path(name) for name in target})
-        if self.store is None:
+        if not self.store:
             raise InputError(
                 "give --picks, --board-poses, or images with the --store that maps their scene"
             )

@@ -125,7 +125,7 @@ class NetworkLocalizer:
         small = camera.short_side_resized(self.contents.short_side)
         matches, patches = self._predicted(encoded, scene, small)
         rough = solve_pnp(matches.pixels, matches.points_m, small, self.options.pnp)
-        if rough is None:
+        if not rough:
             return None
         if self._decides_scene and not moved:
             other = self._scene_at(rough.pose, scene)
@@ -172,7 +172,7 @@ class NetworkLocalizer:
         return self.contents.atlas().scene_at(position)
 
     def _answer(self, best: Rough | None, milliseconds: float) -> PoseEstimate:
-        if best is None:
+        if not best:
             return PoseEstimate.failed("fewer than 6 inliers", milliseconds)
         record = self.contents.scenes[best.scene]
         status, reason = self._status(best, record)
@@ -219,7 +219,7 @@ def _fitting_cameras(
     for i, scene in enumerate(scenes):
         recorded = scene.adjusted_camera
         sizes.append(f"{scene.name} {recorded.width}x{recorded.height}")
-        if camera is None and not recorded.fits(width, height):
+        if not camera and not recorded.fits(width, height):
             cameras[i] = None
     if not any(cameras):
         raise InputError(
@@ -230,6 +230,6 @@ def _fitting_cameras(
 
 
 def _support(hypothesis: Rough | None) -> float:
-    if hypothesis is None:
+    if not hypothesis:
         return 0.0
     return hypothesis.inlier_ratio * hypothesis.inliers**0.5

@@ -54,7 +54,7 @@ class SceneRecord:
         """Apply the intrinsics of the training to the scene's rows; see `corrected_camera`."""
         nominal = self.camera
         refined = self.refined_camera
-        if refined is None:
+        if not refined:
             return
         focal = refined.fx / nominal.fx - 1
         dx = (refined.cx - nominal.cx) / nominal.fx

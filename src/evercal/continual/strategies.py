@@ -41,7 +41,7 @@ class Strategy:
     @property
     def citation(self) -> str:
         """Source of the strategy."""
-        if self.source or self.method is None:
+        if self.source or not self.method:
             return self.source
         return self.method.citation
 

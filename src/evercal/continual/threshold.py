@@ -50,7 +50,7 @@ def fit_threshold(
         estimate = localizer.localize(frame.read_image(), frame.camera)
         positives.append(estimate.inlier_ratio)
         pose = estimate.uncertain_pose
-        if pose is None or frame.base_from_camera is None:
+        if not pose or not frame.base_from_camera:
             continue
         metres, radians = pose_distance(pose.pose, frame.base_from_camera)
         if metres < _NEAR_M and radians < _NEAR_RAD:

@@ -97,7 +97,7 @@ class Encoder:
                     "the encoder has no VLAD centroids; learn a recording first"
                 )
             self.centroids = fit_centroids(features)
-        if self._vlad is None:
+        if not self._vlad:
             assert self._centroids is not None, "just fitted"
             self._vlad = Vlad(self._centroids)
         return self._vlad

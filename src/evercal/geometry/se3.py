@@ -271,7 +271,7 @@ class SE3:
 
 def pose_to_dict(pose: SE3 | None) -> JsonObject | None:
     """Single transform as plain numbers for JSON, metres and wxyz; None stays None."""
-    if pose is None:
+    if not pose:
         return None
     return {
         "translation_m": pose.translation_m.tolist(),

@@ -72,7 +72,7 @@ def fewest_keyframes(
 
 
 def _close(pose: SE3 | None, reference: SE3, unit: float) -> bool:
-    if pose is None:
+    if not pose:
         return False
     metres, radians = pose_distance(pose, reference)
     return bool(metres < MOST_M * unit and radians < np.deg2rad(MOST_DEG))

@@ -105,7 +105,7 @@ def _mapped_already(contents: MapContents, scene: SceneMap) -> list[_Relation]:
         near = other.name in shown or places & other.places.keys()
         if near and other.parent_frame == scene.parent_frame:
             relation = _relation(localizer.within([other.name]), scene, other)
-            found += [] if relation is None else [relation]
+            found += [relation] if relation else []
     return found
 
 

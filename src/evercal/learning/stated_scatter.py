@@ -60,7 +60,7 @@ def located_as_stated(localizer: Localizer, frames: Sequence[Frame]) -> Strings:
         estimate, pose = localizer.located(frame.read_image(), frame.camera)
         assert frame.base_from_camera, "a posed frame"
         stated = scene.frame.from_base(frame.base_from_camera)
-        if estimate.status != "ok" or pose is None or differ(pose, stated):
+        if estimate.status != "ok" or not pose or differ(pose, stated):
             continue
         names.append(frame.name)
     return tuple(names)
@@ -143,7 +143,7 @@ def _aligned(
     for part in parts:
         few = localizer.only(index, part.keyframes)
         for frame in part.frames:
-            if frame.base_from_camera is None:
+            if not frame.base_from_camera:
                 continue
             start = scene.frame.from_base(frame.base_from_camera)
             query = localizer.query(as_rgb(frame.read_image()), frame.camera)

@@ -82,7 +82,7 @@ class LearnTask:
             learned = None
             if file is not None and addresses.exists(file):
                 learned = _kept(file, source.name)
-            if learned is None:
+            if not learned:
                 learned = self._learn(source)
                 if file is not None:
                     _keep(file, self.contents, *learned)

@@ -145,7 +145,7 @@ def align_pose(
     repeats = 0
     while True:
         searched = search.rounds(rounds, camera.changed(change), pose, observed)
-        if searched is None:
+        if not searched:
             return None
         pose, observed = searched
         refined = self_calibrated(observed, camera, pose, change, image.prior)
@@ -198,7 +198,7 @@ def _consistent(observed: Observed, camera: Camera) -> Pose | None:
     valid = np.isfinite(ideal).all(1)
     points = observed.points_m[valid]
     rough = solve_pnp(ideal[valid], points, camera, _LOOSE_PNP)
-    if rough is None or rough.inlier_count < _HOPELESS * observed.expected:
+    if not rough or rough.inlier_count < _HOPELESS * observed.expected:
         return None
     pose = rough.pose
     return pose.rotation_matrix(), pose.translation_m
@@ -249,17 +249,17 @@ class _Search:
         *earlier, last = rounds
         for step in earlier:
             observed = self.run(step, camera, pose, observed)
-            if observed is None:
+            if not observed:
                 return None
             minimum = minimise(observed, camera, pose, step.steps)
             if step.level and _disagree(minimum):
                 rough = _consistent(observed, camera)
-                if rough is None:
+                if not rough:
                     return None
                 minimum = minimise(observed, camera, rough, step.steps)
             pose = minimum.rotation, minimum.position
         observed = self.run(last, camera, pose, observed)
-        if observed is None:
+        if not observed:
             return None
         return pose, observed
 

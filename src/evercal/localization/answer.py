@@ -87,7 +87,7 @@ def answer(
 
     `size` are height and width of the image; `mirrored` is the support of its mirror image.
     """
-    if best is None:
+    if not best:
         return PoseEstimate.failed("fewer than 6 inliers", milliseconds)
     rejected = PoseEstimate(
         status="unknown_scene",

@@ -93,7 +93,7 @@ class PoseEstimate:
     @property
     def uncertain_pose(self) -> UncertainPose | None:
         """Pose with covariance; None if there is no pose."""
-        if self.base_from_camera is None or self.covariance is None:
+        if not self.base_from_camera or self.covariance is None:
             return None
         return UncertainPose(self.base_from_camera, self.covariance)
 

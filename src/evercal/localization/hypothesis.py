@@ -99,13 +99,13 @@ class Aligned(Hypothesis):
 
 def order(hypothesis: Hypothesis | None) -> tuple[float, int]:
     """Poses are ordered by their support, and by PnP inliers where they have none."""
-    if hypothesis is None:
+    if not hypothesis:
         return 0.0, 0
     return hypothesis.support, hypothesis.pnp_inliers
 
 
 def accepted(hypothesis: Hypothesis | None, times: float = 1.0) -> bool:
     """Whether there is a pose with `times` the support that is required."""
-    if hypothesis is None:
+    if not hypothesis:
         return False
     return hypothesis.support >= -times * math.log10(acceptance.FALSE_ACCEPTS)

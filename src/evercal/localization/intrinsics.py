@@ -201,7 +201,7 @@ def cameras_in_scenes(
         )
     cameras = []
     for scene in scenes:
-        if camera is None or _is_own(camera, scene):
+        if not camera or _is_own(camera, scene):
             cameras.append(_own(scene.adjusted_camera, width, height))
         else:
             cameras.append(camera.resized(width, height))

@@ -120,14 +120,14 @@ class Localizer:
         mirrored = 0.0
         if isinstance(best, Aligned) and accepted(best):
             best, rival = settled(self.poses, query, best)
-            if rival is None:
+            if not rival:
                 best, other = in_other_base(self.poses, query, best)
             else:
                 other = InBase.of(contents.scenes[best.scene], rival)
             if not accepted(best, MIRRORED):
                 mirrored = self._mirrored_support(query)
         milliseconds = 1000 * (perf_counter() - began)
-        scene = contents.scenes[0 if best is None else best.scene]
+        scene = contents.scenes[best.scene if best else 0]
         estimate = answer(best, scene, image.shape[:2], milliseconds, other, mirrored)
         return estimate, best
 
@@ -177,13 +177,13 @@ class Localizer:
     def _mirrored_support(self, query: Query) -> float:
         """Support of the mirror image, if it is more similar to keyframes."""
         mirror = self.poses.matcher.mirrored(query)
-        if mirror is None:
+        if not mirror:
             return 0.0
         return order(self._tried(mirror, self.options.attempts[0]))[0]
 
     def _inliers(self, best: Hypothesis | None) -> str:
         """Whether PnP has many inliers, in the words of `Attempt.when`."""
-        if best is None or best.pnp_inliers < self.options.aligned_inliers:
+        if not best or best.pnp_inliers < self.options.aligned_inliers:
             return "few inliers"
         return "many inliers"
 

@@ -46,7 +46,7 @@ class InBase:
     @property
     def inlier_ratio(self) -> float:
         """Of the accepted pose; 0 without one."""
-        return 0.0 if self.aligned is None else self.aligned.inlier_ratio
+        return self.aligned.inlier_ratio if self.aligned else 0.0
 
 
 def in_other_base(
@@ -84,6 +84,6 @@ def _in_base(poses: ScenePoses, query: Query, number: int, predicted: SE3) -> In
     counts = poses.bank.shown(number, start, query.cameras[number])
     candidate = Candidate(number, counts.keyframes[: poses.options.keyframes])
     aligned = poses.aligned(query, candidate, start, np.zeros(INTRINSICS))
-    if aligned is None or not accepted(aligned):
+    if not aligned or not accepted(aligned):
         return InBase(scene, predicted, None, counts.landmarks)
     return InBase.of(scene, aligned)

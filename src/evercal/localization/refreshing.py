@@ -173,7 +173,7 @@ def _usable(
     for (name, image), stated, estimate in zip(images, cameras, estimates, strict=True):
         answer = estimate.uncertain_pose
         camera = estimate.camera
-        if estimate.status != "ok" or answer is None or camera is None:
+        if estimate.status != "ok" or not answer or not camera:
             left_out[name] = estimate.reason or estimate.status.replace("_", " ")
         elif estimate.scene != scene.name:
             left_out[name] = f"shows {estimate.scene}"

@@ -132,7 +132,7 @@ def _other_focal_lengths(
             factors.append(factor)
     cameras = [camera.zoomed(factor) for factor in factors]
     index, pnp = most_inliers(*best.matches, cameras, options)
-    if pnp is None or pnp.inlier_count < best.pnp_inliers:
+    if not pnp or pnp.inlier_count < best.pnp_inliers:
         return
     change = zoomed(factors[index])
     rival = poses.aligned(query, best.candidate, pnp.pose, change)

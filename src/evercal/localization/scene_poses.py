@@ -38,10 +38,10 @@ class ScenePoses:
         """A pose in one scene: match, PnP, align; `matches` are used instead of new ones."""
         scene = candidate.scene
         camera = query.camera(scene).short_side_resized(self.contents.short_side)
-        if matches is None:
+        if not matches:
             matches = self.matcher.matches(query, candidate, camera)
         solution = self._solved(query, candidate, matches, camera)
-        if solution is None:
+        if not solution:
             return None
         pnp, factor = solution
         count = pnp.inlier_count
@@ -58,7 +58,7 @@ class ScenePoses:
                 count,
             )
         aligned = self.aligned(query, candidate, pnp.pose, zoomed(factor))
-        if aligned is None:
+        if not aligned:
             return Rough.unconfirmed(scene, pnp.pose, count)
         aligned = replace(aligned, pnp_inliers=count, matches=matches)
         return self.reselected(query, aligned)
@@ -86,10 +86,10 @@ class ScenePoses:
             options = replace(options, max_iterations=half)
             cameras = [camera.zoomed(factor) for factor in FOCAL_FACTORS]
             index, other = most_inliers(*matches, cameras, options)
-            if best is None or (other and other.inlier_count > best.inlier_count):
+            if not best or (other and other.inlier_count > best.inlier_count):
                 best = other
                 factor = FOCAL_FACTORS[index]
-        if best is None:
+        if not best:
             return None
         return best, factor
 
@@ -110,7 +110,7 @@ class ScenePoses:
             seen = self.bank.seen(best.scene, pose, best.camera)[: options.keyframes]
             candidate = best.candidate._replace(keyframes=seen)
             again = self.aligned(query, candidate, pose, best.change)
-            if again is None:
+            if not again:
                 break
             if again.support < options.reselect_gain * best.support:
                 break
@@ -138,7 +138,7 @@ class ScenePoses:
             options,
             coarse,
         )
-        if refined is None:
+        if not refined:
             return None
         observed = refined.observed
         inliers = refined.residual_px < options.inlier_px

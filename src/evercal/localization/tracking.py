@@ -188,7 +188,7 @@ class Tracker:
         estimate, pose = located
         self._unchecked = 0
         self._ratio = 0.0
-        if estimate.status != "ok" or pose is None:
+        if estimate.status != "ok" or not pose:
             self._poses.clear()
             return estimate, "lost"
         self._remember(pose, stamp, self._small(image))
@@ -236,7 +236,7 @@ class Tracker:
     def _finished(self, until: float) -> "_Running | None":
         """The frame in the background; None if it is not located in time."""
         running = self._running
-        if running is None:
+        if not running:
             return None
         if not wait([running.future], max(until - perf_counter(), 0.0)).done:
             return None
@@ -246,7 +246,7 @@ class Tracker:
     def _adopted(self, until: float) -> bool:
         """Whether the pose of the frame in the background is the prior from now on."""
         finished = self._finished(until - _MARGIN * self._alignment_s)
-        if finished is None:
+        if not finished:
             return False
         located = finished.future.result()
         tracked = finished.tracked
@@ -259,7 +259,7 @@ class Tracker:
         """Follow the landmarks of the last image and align; None if that does not suffice."""
         began = perf_counter()
         predicted = self._predicted(stamp)
-        if predicted is None or self._last is None:
+        if not predicted or not self._last:
             return None
         localizer = self.localizer
         query = localizer.query(image, self.camera)
@@ -275,7 +275,7 @@ class Tracker:
         candidate = Candidate(self._scene, seen[: localizer.options.keyframes])
         pose = localizer.poses.aligned(query, candidate, start, change, coarse=False)
         self._alignment_s = perf_counter() - began
-        if pose is None or not self._trusted(pose, start, small):
+        if not pose or not self._trusted(pose, start, small):
             return None
         if self._may_have_slipped(pose, predicted, stamp):
             return None
@@ -357,10 +357,10 @@ class Tracker:
     def _smooth(self, estimate: PoseEstimate, stamp: float) -> tuple[SE3 | None, bool]:
         """Return the smoothed pose, and whether it follows a jump."""
         pose = estimate.uncertain_pose
-        if self.options.smooth <= 0 or estimate.status != "ok" or pose is None:
+        if self.options.smooth <= 0 or estimate.status != "ok" or not pose:
             self._smoothed = None
             return None, False
-        if self._smoothed is None:
+        if not self._smoothed:
             self._smoothed = (stamp, pose.pose)
             return pose.pose, True
         last_stamp, before = self._smoothed

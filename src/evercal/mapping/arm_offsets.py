@@ -29,7 +29,7 @@ def with_offsets(frames: Sequence[Frame], offsets: ArmOffsets) -> list[Frame]:
     changed = []
     for frame in frames:
         before = frame.base_from_gripper
-        if frame.joints_rad is None or before is None:
+        if frame.joints_rad is None or not before:
             changed.append(frame)
             continue
         after = offsets.poses(np.array([frame.joints_rad]))[0]
@@ -47,7 +47,7 @@ def camera_in_gripper(
     frames: Sequence[Frame], stated: SE3, mount: Mount | None
 ) -> SE3 | None:
     """(n,) stated poses of the cameras in the gripper; None where camera poses were stated."""
-    if mount is None:
+    if not mount:
         return None
     if not mount.moves:
         return stated

@@ -194,7 +194,7 @@ def _prepare(
         unit = scale
         prepared = prepared.in_unit(scale)
     check = check_poses(prepared, pairs, options.confirmed)
-    if options.mount is None:
+    if not options.mount:
         require_consistent(prepared, pairs, check)
     consistent = prepared.without(check.excluded)
     # Other frames replace excluded keyframes.
@@ -233,7 +233,7 @@ def _adjust(
     adjustment = None
     kinds = None
     # Stated joint values show their offsets better than poses.
-    if options.mount and arm is None:
+    if options.mount and not arm:
         kinds = shared_errors(stated_grippers(prepared.frames), options.errors)
     for number in range(options.rounds):
         on_progress("adjusting", number, options.rounds)

@@ -119,7 +119,7 @@ class BundleOptions:
     def intrinsics_sigma(self, camera: Camera) -> Array:
         """Prior standard deviations (8,) of the intrinsics, in the order of `Camera.slopes`."""
         sigma = np.full(INTRINSICS, FIXED)
-        if self.lens_sigma is None:
+        if not self.lens_sigma:
             sigma[0] = self.focal_sigma
             sigma[1:3] = self.centre_sigma_px
             if not any(camera.distortion):

@@ -116,14 +116,14 @@ class MapFrame:
     @property
     def shared_m(self) -> float:
         """Root mean square per axis of errors of stated positions that neighbours share."""
-        if self.correction is None:
+        if not self.correction:
             return self.frame_sigma[0]
         return float(np.sqrt((self.correction.correction[:, :3] ** 2).mean()))
 
     @property
     def scale(self) -> float:
         """Units of length of an answer per unit of the map."""
-        return 1.0 if self.similarity is None else self.similarity.scale
+        return self.similarity.scale if self.similarity else 1.0
 
     @property
     def slope(self) -> Array:
@@ -149,7 +149,7 @@ class MapFrame:
 
     def points_to_base(self, points_m: Array) -> Array:
         """Landmarks (n, 3) in the base frame."""
-        return points_m if self.similarity is None else self.similarity.points(points_m)
+        return self.similarity.points(points_m) if self.similarity else points_m
 
     def camera_among_points(self, base_from_camera: SE3) -> SE3:
         """The pose at which a located camera observes landmarks from `points_to_base`.
@@ -157,11 +157,11 @@ class MapFrame:
         It differs from the answer by the corrections that `to_base` undoes.
         """
         pose = self.from_base(base_from_camera)
-        return pose if self.similarity is None else self.similarity.pose(pose)
+        return self.similarity.pose(pose) if self.similarity else pose
 
     def _undo(self, pose: SE3) -> SE3:
         stated = pose @ self.common.inverse()
-        if self.correction is None:
+        if not self.correction:
             return stated
         return pose @ SE3.exp(-self.correction.at(stated)) @ self.common.inverse()
 

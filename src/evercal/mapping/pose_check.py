@@ -145,7 +145,7 @@ class _SiftCheck:
         disagree = 0
         for partner in partners:
             pair = self._pair(frame, partner)
-            if pair is None:
+            if not pair:
                 continue
             if _distance(self.recording, pair) <= MAX_SIFT_PX:
                 agree += 1

@@ -138,7 +138,7 @@ def shared_variances(
     groups = [_SHIFT_GROUP]
     if options.common_stated:
         groups += _COMMON_GROUPS
-    if options.lens_sigma is None:
+    if not options.lens_sigma:
         groups += _LENS_GROUPS
     for group in groups:
         variances[group] = group_variance(

@@ -157,7 +157,7 @@ def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFram
             moved = _motion(last, small)
         if moved > motion:
             sharp = float(cv2.Laplacian(small, cv2.CV_64F).var())
-            if best is None or sharp > best[0]:
+            if not best or sharp > best[0]:
                 best = (sharp, frame, small)
     if best:
         yield best[1]

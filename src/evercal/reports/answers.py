@@ -77,7 +77,7 @@ def answer_row(answer: Answer) -> dict[str, object]:
 def finite_pose(estimate: "PoseEstimate") -> "UncertainPose | None":
     """The pose with its covariance; None without a usable one."""
     uncertain = estimate.uncertain_pose
-    if uncertain is None or all(map(math.isfinite, uncertain.covariance.flat)):
+    if not uncertain or all(map(math.isfinite, uncertain.covariance.flat)):
         return uncertain
     return None
 

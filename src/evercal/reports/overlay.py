@@ -73,7 +73,7 @@ def draw_landmarks(
     pixels = estimate.pixels
     points = estimate.points_m
     located = estimate.base_from_camera is not None
-    if not located or pose is None or pixels is None or points is None:
+    if not located or not pose or pixels is None or points is None:
         reason = estimate.reason or estimate.status.replace("_", " ")
         return LandmarkPicture(large, 0, reason)
     scene = next(s for s in localizer.contents.scenes if s.name == estimate.scene)

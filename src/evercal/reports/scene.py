@@ -233,7 +233,7 @@ def keyframe_views(scene: SceneMap) -> list[KeyframeView]:
 
 def _scale(scene: SceneMap) -> float:
     similarity = scene.frame.similarity
-    if similarity is None:
+    if not similarity:
         return 1.0
     return similarity.scale
 

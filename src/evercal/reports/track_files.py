@@ -66,7 +66,7 @@ class TrackFile(AbstractContextManager["TrackFile"]):
 
 def _tum_line(frame: TrackedFrame) -> str:
     pose = frame.smoothed or frame.estimate.base_from_camera
-    if pose is None or frame.state == "lost":
+    if not pose or frame.state == "lost":
         return ""
     w, x, y, z = pose.rotation_wxyz
     values = (frame.stamp_s, *pose.translation_m, x, y, z, w)

@@ -34,7 +34,7 @@ def joint_slopes(poses: SE3, arm: Arm | None) -> Array:
     Raises:
         InputError: The arm does not reach most poses.
     """
-    if arm is None:
+    if not arm:
         kinds = zip(
             product(
                 _SHOULDERS,

@@ -108,7 +108,7 @@ class ArmErrors(NamedTuple):
         if self.accuracy_m is not None:
             lever_m = np.sqrt((slopes[:, :3] ** 2).sum() / len(slopes))
             return self.accuracy_m / float(lever_m)
-        if self.arm is None:
+        if not self.arm:
             return _UNKNOWN_RAD
         from evercal.robot.known_arms import ARM_NAMES, USUAL_RAD
 

@@ -110,7 +110,7 @@ class _Connection(_Patient, H11Protocol):
         super().handle_websocket_upgrade(event)
 
     def _deadline(self) -> float:
-        if self.latest is None:
+        if not self.latest:
             return 0.0
         return self.latest.when()
 

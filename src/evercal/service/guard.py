@@ -163,7 +163,7 @@ class Guard:
                 message = {**message, "headers": headers_sent}
             await send(message)
 
-        if refusal is None and length:
+        if not refusal and length:
             self._bodies.add(body)
         try:
             await app(scope, body.part, counted)
@@ -188,7 +188,7 @@ class Guard:
         receive: Receive,
         send: Send,
     ) -> None:
-        if refusal is None and self._streams >= self._limits.streams:
+        if not refusal and self._streams >= self._limits.streams:
             refusal = 429, "too many streams"
         if refusal:  # the handshake gets status 403
             return await send(

@@ -293,7 +293,7 @@ def _name(file: Upload, default: str) -> str:
 
 
 async def _content(file: Upload | None) -> bytes | None:
-    if file is None:
+    if not file:
         return None
     return await file.read()
 
@@ -334,7 +334,7 @@ async def track(
         localizer = service.live.localizer
         image = decoded(frame.data, name, service.limits)
         # The map or the camera changed.
-        if tracker is None or tracked != (localizer, frame.intrinsics):
+        if not tracker or tracked != (localizer, frame.intrinsics):
             camera = camera_of(frame.intrinsics or None, image.shape[1::-1])
             tracker = Tracker(service.live.within(scene), camera)
             tracked = (localizer, frame.intrinsics)

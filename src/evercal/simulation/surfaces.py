@@ -118,7 +118,7 @@ def draw(
     if np.cross(edge_u, edge_v) @ corner >= 0:  # back side
         return
     window = _window(corner + _CORNERS @ edges.T, camera)
-    if window is None:
+    if not window:
         return
     # image ~ K [edges | corner] (s, t, 1): its inverse gives texture coordinates and 1 / depth.
     image_from_texture = camera.matrix() @ np.column_stack([edges, corner])

@@ -190,7 +190,7 @@ def board_pose(
     view: BoardView, camera: Camera, start: SE3 | None = None, bend: Bend | None = None
 ) -> BoardPose:
     """Fit the pose of a board to its corners, from a start or from the better of its candidates."""
-    if start is None:
+    if not start:
         starts = board_pose_candidates(view, camera)
         fits = (board_pose(view, camera, candidate, bend) for candidate in starts)
         return min(fits, key=lambda pose: pose.squared_px)

@@ -50,7 +50,7 @@ def _widened(
 ) -> BoardImage:
     """The image with a covariance that contains another pose of the board."""
     pose = image.camera_from_board
-    if pose is None or other is None:
+    if not pose or not other:
         return image
     shift = other.translation_m - pose.translation_m
     away = np.r_[shift, (pose.inverse() @ other).log()[3:]]

@@ -60,7 +60,7 @@ def corrected_urdf(export: Export) -> bytes:
         if joint.is_angle:
             kind = "revolute"
         origin = model.origins_with({joint.name: 0.0}).get(joint.name)
-        if origin is None or origin[1] != joint.is_angle:
+        if not origin or origin[1] != joint.is_angle:
             raise InputError(
                 f"{file}: has no {kind} joint {joint.name} with a value of its own; give the arm's"
                 f" URDF"

@@ -117,7 +117,7 @@ class Export:
     @property
     def camera(self) -> Camera:
         """Intrinsics; raises InputError if the calibration has no intrinsics."""
-        if self.calibration.camera is None:
+        if not self.calibration.camera:
             raise InputError(
                 "intrinsics are required, but this calibration holds no camera"
             )

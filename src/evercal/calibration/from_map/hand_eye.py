@@ -157,7 +157,7 @@ def _from_given(
     calibration: Calibration, given: SE3 | None
 ) -> Pair | tuple[None, None]:
     """Distance from a given transform, which is taken to be for the stated intrinsics."""
-    if given is None:
+    if not given:
         return None, None
     return pose_distance_mm_deg(calibration.for_program().parent_from_child, given)
 
@@ -175,7 +175,7 @@ def verdict_of(calibration: Calibration, warnings: Sequence[str], advice: str) -
 def _advice(frames: Sequence[Frame], gripper_from_camera: UncertainPose) -> str:
     grippers = stated_grippers(frames)
     open_direction = open_position(grippers, gripper_from_camera.pose)
-    if open_direction is None:
+    if not open_direction:
         return ""
     variances = np.linalg.eigvalsh(gripper_from_camera.covariance[:3, :3])
     return open_direction.sentence(1000 * float(np.sqrt(variances[-1])))

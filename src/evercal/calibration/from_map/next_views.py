@@ -177,7 +177,7 @@ def _known(recorded: SE3, gripper_from_camera: SE3 | None) -> tuple[SE3, Array, 
     mount = gripper_from_camera or SE3.identity()
     scene_m = looked_at(recorded @ mount)
     known = np.zeros((13, 13))
-    known[:6, :6] = np.linalg.inv(_UNKNOWN if gripper_from_camera is None else _ROUGH)
+    known[:6, :6] = np.linalg.inv(_ROUGH if gripper_from_camera else _UNKNOWN)
     known[6:12, 6:12] = np.linalg.inv(_ANYWHERE)
     known[12, 12] = _ANY_SCALE**-2
     known += wrist_information(recorded, mount, scene_m).sum(0)

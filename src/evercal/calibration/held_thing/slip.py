@@ -60,7 +60,7 @@ def motion_warnings(
         (correction.moved, "the camera"),
     ):
         step = largest_step(np.array([residuals[name] for name in names]))
-        if step and (largest is None or step.share > largest.share):
+        if step and (not largest or step.share > largest.share):
             largest = step
             what = carrier
     drift_deg = drift_deg_of(background)
@@ -117,6 +117,6 @@ def largest_step(values: Array) -> Step | None:
         chance = stats.f.sf(ratio, 3, freedom).min() * 2 * n
         share = float((by_step / np.maximum(total, 1e-18)).max())
         is_step = chance < SLIP_CHANCE and share > SLIP_SHARE
-        if is_step and (best is None or share > best.share):
+        if is_step and (not best or share > best.share):
             best = Step(k, size, share)
     return best

@@ -64,7 +64,7 @@ class _Poses:
         return self.names or tuple(f"row {i + 1}" for i in range(len(self.poses)))
 
     def corners_of(self, rows: IntArray) -> BoardCorners | None:
-        if self.board is None:
+        if not self.board:
             return None
         views = []
         left_out = []

@@ -312,6 +312,6 @@ def measured(
 
 def middle_of(corners: BoardCorners | None) -> Array:
     """(3,) middle of the board's corners, metres; the origin without corners."""
-    if corners is None:
+    if not corners:
         return np.zeros(3)
     return np.mean([view.points_m.mean(0) for view in corners.views], 0)

@@ -162,7 +162,7 @@ def other_conventions(
         numbers: PoseNumbers | None,
         other: SE3,
     ) -> None:
-        if numbers is None:  # its file leaves no choice
+        if not numbers:  # its file leaves no choice
             return
         for names, poses in _reread(numbers):
             if every or _mismatch_rad(poses, other) < _mismatch_rad(robot, camera):

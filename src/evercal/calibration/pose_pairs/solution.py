@@ -83,7 +83,7 @@ class PairSolution:
     @property
     def camera(self) -> Camera | None:
         """Estimated intrinsics, with corners."""
-        if self.lens is None:
+        if not self.lens:
             return None
         change = self.fit.at.extras[self.equation.extras.indices("intrinsics")]
         return moved_lens(

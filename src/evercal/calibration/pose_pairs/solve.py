@@ -128,13 +128,13 @@ def solve_pose_pairs(
     # Errors that poses share look like a step, and a step like errors that poses share.
     if slip and slip.evidence < evidence:
         slip = None
-    if slip is None and evidence > WANTED:
+    if not slip and evidence > WANTED:
         equation = sharing
         fit = robust_fit(equation, agreement(equation, fit.at))
     warnings: list[str] = []
     if scale_known:
         equation, fit, warnings = with_tested_size(equation, fit, corners, of_board)
-    if slip is None:
+    if not slip:
         warnings += second_group(equation, fit, rows, pairs.names)
     else:
         fit = replace(fit, covariance=fit.covariance + slip.spread)
@@ -245,7 +245,7 @@ class _Problem:
             equation = self.equation(pairs, lens, accepted)[rows]
             at = replace(at, extras=np.zeros(len(equation.extras.names)))
             fit = robust_fit(equation, agreement(equation, at))
-            if self.corners is None or lens is None:
+            if not self.corners or not lens:
                 return equation, fit, None
             before = accepted
             accepted = np.isin(np.arange(len(pairs)), rows[fit.inliers])
@@ -297,7 +297,7 @@ class _Problem:
             spread = lever @ pairs.camera_covariance @ lever.transpose(0, 2, 1)
             moved = replace(moved, camera_covariance=spread)
         length = moved.camera_from_board.translation_m
-        if lens is None and self.scale_known and self.of_board:
+        if not lens and self.scale_known and self.of_board:
             depth = np.pad(length[:, 2:], ((0, 0), (2, 3)))
             extras = extras.with_one("shared depth", depth, SIZE_SIGMA)
         size = np.pad(length, ((0, 0), (0, 3)))

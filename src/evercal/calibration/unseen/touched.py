@@ -93,7 +93,7 @@ def touched_data(
 ) -> Data:
     """Pixels of touched points, and depths if measured; gripper poses are by names of images."""
     camera = calibration.camera
-    if camera is None:
+    if not camera:
         raise InputError("the calibration has no intrinsics, so points have no pixels")
     points = touches.positions(touches.base_from_gripper, np.zeros(3))
     _require_usable(picks, points, camera)

@@ -172,7 +172,7 @@ def read_frames(folder: Path) -> Table:
 
 def _read(folder: Path, name: str, required: set[str]) -> Table:
     path = min(folder.glob(f"{name}*"), default=None)
-    if path is None:
+    if not path:
         return pd.DataFrame(columns=sorted(required))
     if path.name == name:
         _remove_incomplete_line(folder, path)

@@ -86,7 +86,7 @@ def run_strategy(
     Yields results of the stages that were not complete before. The folder `out` has the stores of
     runs in progress in `runs`, and encoded views in `features`.
     """
-    if strategy.method is None:
+    if not strategy.method:
         return _MapRun(strategy, scenes, options, seed, out).stages()
     run = _NetworkRun(strategy, scenes, options, seed, out)
     if strategy.jointly:

@@ -117,7 +117,7 @@ def load_suite(
     if name == "sim-mini":
         rooms = {room.scene.name: room.scene for room in sample_rooms()}
         return [rooms[scene] for scene in names]
-    if data is None:
+    if not data:
         raise InputError("this suite needs recordings: give their folder with `data`")
     for scene in names:
         if not (data / scene).is_dir():

@@ -50,7 +50,7 @@ def learn(
     atlas = after.atlas(options.grid_scenes)
     cell, buffer = _begun(rows, atlas, recording, method.head_per_scene)
     head = after.heads[-1]
-    if teacher is None:
+    if not teacher:
         _whiten(head, [buffer], options.seed)
     memories = []
     if method.replays:

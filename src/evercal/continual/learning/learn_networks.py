@@ -99,7 +99,7 @@ class NetworkLearnOptions:
             )
         heads = opened.contents.heads
         method = strategy.method
-        if self.centres is None or method is None or method.head_per_scene:
+        if self.centres is None or not method or method.head_per_scene:
             return opened
         for head in heads[-1:]:
             count = head.options.centres_per_scene
@@ -130,7 +130,7 @@ def learn_networks(
     strategy = options.strategy
     if isinstance(strategy, str):
         strategy = strategy_named(strategy)
-    if strategy.method is None or strategy.jointly:
+    if not strategy.method or strategy.jointly:
         raise InputError(
             f"strategy {strategy.name!r}: does not train a network scene by scene; use another"
             " strategy, or compare it with 'evercal bench'"

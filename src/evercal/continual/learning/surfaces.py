@@ -90,7 +90,7 @@ def shared_depths(
 
     `cache` is the folder of the depths of all runs; without one they are always estimated.
     """
-    if cache is None:
+    if not cache:
         return frame_depths(frames, encoder, short_side)
     key = hashlib.blake2b(digest_size=16)
     poses = stated_poses(frames).matrix()

@@ -29,7 +29,7 @@ class LearningWithoutForgetting(Method):
 
     def begin(self, start: StageStart) -> TrainingHooks:
         """Distil on new rows, from the second scene on."""
-        if start.teacher is None:
+        if not start.teacher:
             return TrainingHooks()
         return _DistillationHooks(self, start.teacher, start.replay_rows)
 

@@ -46,7 +46,7 @@ class Ros2Camera(StreamCamera):
         except InputError as error:
             raise InputError(f"{error}, or give the intrinsics") from None
         message = infos.next(self._timeout_s)
-        if message is None:
+        if not message:
             raise InputError(f"ros2:{topic}: nothing arrives; give the intrinsics")
         size = (width, height)
         return camera_info_of(f"ros2:{topic}", message.content, size, images)
@@ -56,7 +56,7 @@ class Ros2Camera(StreamCamera):
 
     def _next(self) -> StreamFrame | None:
         message = self._images.next(self._timeout_s)
-        if message is None:
+        if not message:
             return None
         content = message.content
         decode = compressed_image_of if self._images.kind == COMPRESSED else image_of

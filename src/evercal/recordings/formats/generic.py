@@ -196,7 +196,7 @@ class SceneWriter:
         stored = None
         if isinstance(frame.image, StoredImage):
             stored = frame.image.file()
-        if stored is None:
+        if not stored:
             with self._new(f"{stem}.png") as path:
                 write_image(path, frame.read_image())
         else:

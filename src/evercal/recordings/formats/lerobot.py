@@ -62,7 +62,7 @@ def load(root: Path, options: ReadOptions) -> Recording:
 def _load(root: Path, options: ReadOptions) -> Recording:
     info = dataset_info(root)
     key = camera_key(root, info, options.image_topic)
-    if options.camera is None:
+    if not options.camera:
         raise InputError(
             f"{root}: LeRobot datasets hold no intrinsics; give them with `camera`"
         )

@@ -70,7 +70,7 @@ def _sequences(root: Path, split: str) -> list[Path]:
     folders = []
     for line in filter(None, map(str.strip, text.splitlines())):
         match = re.fullmatch(r"(?:sequence|seq-?)?(\d+)", line, re.IGNORECASE)
-        if match is None:
+        if not match:
             raise InputError(
                 f"{file}: cannot read line {line!r}; a line looks like 'sequence1'"
             )

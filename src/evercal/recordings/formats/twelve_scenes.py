@@ -36,7 +36,7 @@ def _test_count(root: Path, frames: int) -> int:
     file = root / "split.txt"
     text = read_text(file, "split file", "its first line is '... [frames=N]'")
     match = re.search(r"\[frames=(\d+)\]", text.split("\n")[0])
-    if match is None:
+    if not match:
         raise InputError(f"{file}: the first line holds no '[frames=N]'")
     if int(match[1]) > frames:
         raise InputError(

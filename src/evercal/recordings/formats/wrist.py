@@ -150,7 +150,7 @@ def _frames(root: Path, layout: RecordingLayout, options: ReadOptions) -> Record
             body_from_camera = SE3.from_matrix(np.reshape(numbers, (4, 4)))
         poses = [pose and pose @ body_from_camera for pose in poses]
     intrinsics = options.camera
-    if intrinsics is None and layout.camera and file.exists():
+    if not intrinsics and layout.camera and file.exists():
         intrinsics = file
     cameras = _cameras(root, intrinsics, images)
     is_gripper = layout.poses in _POSES + _JOINTS
@@ -224,7 +224,7 @@ def _images(root: Path, folders: Sequence[str]) -> list[Path]:
 
 def _cameras(root: Path, file: Path | None, images: Sequence[Path]) -> list[Camera]:
     """Of each image, from a file for all or from a folder of one for each."""
-    if file is None:
+    if not file:
         file = _camera_beside(root)
     if file.is_dir():
         return _cameras_in(file, images)

@@ -99,7 +99,7 @@ def poses_of_images(
     poses = []
     missing = []
     for name, pose in zip(names, paired, strict=True):
-        if pose is None:
+        if not pose:
             missing.append(name)
         else:
             poses.append(pose)

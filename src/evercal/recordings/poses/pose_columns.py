@@ -252,9 +252,9 @@ def plain_numbers(numbers: Array, given: Given, names: Names = None) -> PoseTabl
             )
         numbers = numbers.reshape(len(numbers), -1)
     width = numbers.shape[1]
-    if given is None and width in (12, 13, 16, 17):
+    if not given and width in (12, 13, 16, 17):
         given = matrix_convention(numbers[:, width % 4 :])
-    if given is None:
+    if not given:
         raise ConventionError(
             f"{width} columns without a header do not define a pose; write a header such as"
             f" x,y,z,qw,qx,qy,qz",

@@ -128,7 +128,7 @@ def _of_objects(entries: list[Any], given: Given, robot: bool) -> PoseTable:
     columns = _of_role(columns, given, robot)
     frames = [_frame_of(columns, key) for key in ("header_frame_id", "child_frame_id")]
     table = _of_arrays(columns, given, plural=False)
-    if table is None:
+    if not table:
         table = _of_cells(columns, given)
     fixed = "quaternion_wxyz" in columns and "matrix" not in columns
     return table._replace(fixed=fixed, frames=FrameNames(*frames))

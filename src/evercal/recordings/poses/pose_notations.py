@@ -60,7 +60,7 @@ def without_brackets(lines: list[str], given: Given) -> tuple[list[str], Given]:
             raise ValueError(
                 f"{line.strip()[:60]!r} is beside poses in {kind}; use one notation"
             )
-    if given is None and kind == "{":
+    if not given and kind == "{":
         given = pose_convention("kuka")
     return _rows(re.findall(pattern, text), columns), given
 

@@ -91,7 +91,7 @@ class Page:
         camera = open_camera(source)
         height, width = camera.read()[1].shape[:2]
         size = (width, height)
-        if intrinsics is None:
+        if not intrinsics:
             stated = camera.intrinsics()
         else:
             stated = read_camera(intrinsics, size)
@@ -191,7 +191,7 @@ class Page:
             estimate = tracked.estimate
             rows = [("time", f"{estimate.milliseconds:.0f} ms")]
             pose = estimate.uncertain_pose
-            if pose is None or estimate.status != "ok":
+            if not pose or estimate.status != "ok":
                 drawing.place(node, None)
             else:
                 drawing.place(node, pose.pose)

@@ -110,7 +110,7 @@ class BagFile:
             # The lock is free between two messages, so that the caller may read others.
             with self._lock:
                 message = next(messages, None)
-            if message is None:
+            if not message:
                 return
             yield message
 
