@@ -20,7 +20,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from filelock import FileLock, Timeout
 
@@ -28,7 +28,7 @@ from evercal.errors import InputError
 from evercal.storage.atomic import replace_folder, write_json
 from evercal.storage.manifest import MANIFEST, Manifest, write_manifest
 from evercal.storage.text_files import is_link, read_json
-from evercal.typing import JsonObject, Record
+from evercal.typing import dict[str, Any], Record
 
 SCHEMA = 6
 """Version of the files of a store."""
@@ -269,7 +269,7 @@ class StageStore(Generic[Contents]):
                 stages, {stage: write_copy}, settings, before, lambda _: False
             )
 
-    def reports(self) -> list[JsonObject]:
+    def reports(self) -> list[dict[str, Any]]:
         """`report.json` of every stage, in order."""
         return [read_report(self.folder(name)) for name in self.stages]
 
@@ -391,7 +391,7 @@ def _made(manifest: Manifest) -> int:
     return int(manifest.payload.get(_MADE, len(manifest.payload["stages"])))
 
 
-def read_report(folder: Path) -> JsonObject:
+def read_report(folder: Path) -> dict[str, Any]:
     """Read `report.json` of a stage."""
     return read_json(folder / REPORT, "report of a scene", "restore the map")
 
