@@ -20,7 +20,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from filelock import FileLock, Timeout
 
@@ -28,7 +28,7 @@ from evercal.errors import InputError
 from evercal.storage.atomic import replace_folder, write_json
 from evercal.storage.manifest import MANIFEST, Manifest, write_manifest
 from evercal.storage.text_files import is_link, read_json
-from evercal.typing import dict[str, Any], Record
+from evercal.typing import JsonObject, Record as Payload
 
 SCHEMA = 6
 """Version of the files of a store."""
@@ -49,8 +49,6 @@ _MADE = "made"
 Result = TypeVar("Result")
 Contents = TypeVar("Contents")
 Names = Sequence[str]
-Payload = Record
-"""Settings of a store, or a report."""
 Superseded = Callable[[str], bool]
 """Whether a file of a kept stage, by its name, is dropped."""
 Write = Callable[[Path], None]
@@ -269,7 +267,7 @@ class StageStore(Generic[Contents]):
                 stages, {stage: write_copy}, settings, before, lambda _: False
             )
 
-    def reports(self) -> list[dict[str, Any]]:
+    def reports(self) -> list[JsonObject]:
         """`report.json` of every stage, in order."""
         return [read_report(self.folder(name)) for name in self.stages]
 
@@ -391,7 +389,7 @@ def _made(manifest: Manifest) -> int:
     return int(manifest.payload.get(_MADE, len(manifest.payload["stages"])))
 
 
-def read_report(folder: Path) -> dict[str, Any]:
+def read_report(folder: Path) -> JsonObject:
     """Read `report.json` of a stage."""
     return read_json(folder / REPORT, "report of a scene", "restore the map")
 
