@@ -47,7 +47,7 @@ def arm_pictures(
     start = fitter.start(calibration.parent_from_child.inverse())
     start = replace(start, camera=calibration.camera.pinhole)
     start.offsets[:] = [joint.offset for joint in calibration.joints]
-    priors = Priors(joints=np.zeros(len(joints)))
+    priors = Priors(usual=np.zeros(len(joints)), pose_only=True)
     every = range(len(frames))
     equations = fitter.fit(start, priors, every, _REACHES_PX, 2.0, (0, 1)).equations
     pictures = {}
