@@ -289,6 +289,14 @@ TABLES: dict[str, Callable[[], Table]] = {
         "condition,method,draws,refused,mm,mm_90,deg,sigma_mm,inside_95,squared_mahalanobis",
         "eye-to-hand",
     ),
+    "arm-in-view: conditions": _rows(
+        "condition,draws,refused,warned,mm,mm_90,deg,sigma_mm,inside_95,wrong,seconds",
+        "arm-in-view",
+    ),
+    "arm-in-view: beside": _rows(
+        "condition,draws,refused,mm,deg,sigma_mm,sigma_deg,seconds",
+        "arm-in-view-beside",
+    ),
     "boards: mistakes": _rows("mistake,draws,refused,warned,named,safe", "mistakes"),
     "boards: detection": _rows(
         "board,tilt_deg,finder,found,any_of_opencv,rms_px,ms", "boards"
