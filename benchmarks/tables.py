@@ -293,6 +293,10 @@ TABLES: dict[str, Callable[[], Table]] = {
         "condition,draws,refused,warned,mm,mm_90,deg,sigma_mm,inside_95,wrong,seconds",
         "arm-in-view",
     ),
+    "arm-in-view: parts": _rows(
+        "condition,draws,mm,mm_90,deg,sigma_mm,inside_95,squared_mahalanobis",
+        "arm-in-view-parts",
+    ),
     "arm-in-view: beside": _rows(
         "condition,draws,refused,mm,deg,sigma_mm,sigma_deg,seconds",
         "arm-in-view-beside",
