@@ -40,7 +40,8 @@ def read_cell(root: Path, n: int) -> Cell:
     """The first images of a recording of `rooms.arms`."""
     truth = json.loads((root / "truth.json").read_text())
     folder = root / "recording"
-    images = [cv2.imread(str(folder / f"{i:03d}.png")) for i in range(n)]
+    files = [folder / f"{i:03d}.png" for i in range(n)]
+    images = [np.asarray(cv2.imread(str(file))) for file in files]
     pose = truth["base_from_camera"]
     camera = Camera.from_dict(json.loads((folder / "camera.json").read_text()))
     return Cell(

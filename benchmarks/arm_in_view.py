@@ -241,7 +241,7 @@ def _solved(cell: Cell) -> Row:
     pose = answer.uncertain_pose
     errors = [pose_error(pose, truth) for truth in cell.base_from_camera]
     row = min(errors, key=lambda error: float(error["mm"]))
-    row |= {"seconds": seconds, "warnings": "; ".join(answer.checks.warnings)}
+    row |= {"seconds": seconds, "warnings": "; ".join(answer.checks.warnings or [])}
     return row | {"confirmed": float(answer.checks.outline_confirmed or 0)}
 
 

@@ -20,7 +20,7 @@ class Part:
     vertices_m: np.ndarray
     normals: np.ndarray
     faces: np.ndarray
-    colour: tuple[float, float, float]
+    colour: tuple[float, ...]
     """Share of light that is reflected, linear RGB."""
 
 
