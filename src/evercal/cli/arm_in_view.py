@@ -57,6 +57,12 @@ class ArmInView(args.Verb):
                 self.without,
                 on_progress=bars.step,
             )
+        lost = ", ".join(calibration.source["links_not_shown"])
+        if lost:
+            words = (
+                f"the images do not show the outline of {lost}: another mesh or tool?"
+            )
+            say_notes([words])
         source = {**calibration.source, "without": self.without}
         calibration = replace(calibration, source=source)
         calibration.write(self.out)

@@ -155,8 +155,6 @@ class Offsets(NamedTuple):
     """(m,) whether the image shows the end of the arm there."""
     testable: BoolArray
     """(m,) whether the background beside it is known."""
-    contrast: Array
-    """(m,) how much brighter the arm is than the background, -1 to 1."""
 
 
 def image_offsets(
@@ -165,41 +163,41 @@ def image_offsets(
     """Find where image `i` ends to differ from the background, along the normals of points."""
     if not len(points.link):  # the arm is beside the image
         none = np.zeros(0)
-        return Offsets(none, none > 0, none > 0, none)
-    step = 1.0 if reach_px > _FINE_PX else 0.5
+        return Offsets(none, none > 0, none > 0)
+    is_fine = reach_px <= _FINE_PX
+    step = 0.5 if is_fine else 1.0
     end = reach_px + _AROUND
     along = np.arange(-end, end + step / 2, step)
     grid = points.pixels[:, None] + along[:, None] * points.normals[:, None]
     differs = _sampled_at(views.difference[i], grid)
     known = _sampled_at(views.known.astype(np.float32), grid) > 0.99
     like = np.clip(differs / (_CONTRAST * views.noise) - 1, -1, 1) * known
-    near = round(_AROUND / step)
-    signed = _sampled_at(views.signed(i), grid)
-    # The best end of the arm: like it before, unlike it after.
-    total = np.cumsum(like, 1)
-    score = 2 * total - total[:, -1:]
-    best = _best(score, along, reach_px)
-    side = round(_SIDE / step)
-    if reach_px <= _FINE_PX:
-        centre = np.searchsorted(along, 0.0)
-        profile, _ = _profile(signed, np.full(len(grid), centre), side)
+    if is_fine:
+        profile = _profile(_sampled_at(views.signed(i), grid), along)
+        side = round(_SIDE / step)
         best = _best(_steps(profile, side), along, reach_px)
-    profile, sign = _profile(signed, best, side)
-    window = best[:, None] + np.arange(-near, near + 1)
-    window = np.clip(window, 0, len(along) - 1)
-    around = np.take_along_axis(like, window, 1)
-    beside = np.take_along_axis(profile, window, 1)
-    inside = beside[:, near - side - 1 : near - 1].mean(1)
-    outside = beside[:, near + 2 : near + side + 2].mean(1)
-    crossing = _crossing(profile, best, (inside + outside) / 2)
+        crossing = _crossing(profile, best, side)
+    else:
+        # The best end of the arm: like it before, unlike it after.
+        total = np.cumsum(like, 1)
+        best = _best(2 * total - total[:, -1:], along, reach_px)
+        crossing = best + 0.5
     px = along[0] + step * crossing
-    confirmed = np.isfinite(px) & (np.abs(px) <= reach_px)
+    near = round(_AROUND / step)
     blurred = round(_BLURRED / step)
+    around = _beside(like, best, near)
+    confirmed = np.isfinite(px) & (np.abs(px) <= reach_px)
     confirmed &= around[:, : near - blurred].mean(1) > _INSIDE
     confirmed &= around[:, near + blurred + 1 :].mean(1) < _OUTSIDE
     testable = known[:, np.abs(along) <= _AROUND].all(1)
-    contrast = sign * inside / 255
-    return Offsets(np.where(confirmed, px, 0.0), confirmed, testable, contrast)
+    return Offsets(np.where(confirmed, px, 0.0), confirmed, testable)
+
+
+def _beside(values: Array, at: IntArray, near: int) -> Array:
+    """(m, 2 near + 1) values (m, k) around samples (m,)."""
+    window = at[:, None] + np.arange(-near, near + 1)
+    window = np.clip(window, 0, values.shape[1] - 1)
+    return np.take_along_axis(values, window, 1)
 
 
 def _best(score: Array, along: Array, reach_px: float) -> IntArray:
@@ -207,19 +205,13 @@ def _best(score: Array, along: Array, reach_px: float) -> IntArray:
     return np.where(np.abs(along) <= reach_px, score, -np.inf).argmax(1)
 
 
-def _profile(
-    signed: Float32Array, end: IntArray, near: int
-) -> tuple[Float32Array, Array]:
-    """(m, k) differences in the channel of (m, k, 3) that differs most, and (m,) its sign.
-
-    The arm is in the `near` samples before its end (m,); there they are made positive.
-    """
-    inside = np.clip(end[:, None] - 1 - np.arange(near), 0, signed.shape[1] - 1)
-    within = np.take_along_axis(signed, inside[..., None], 1).mean(1)
+def _profile(signed: Float32Array, along: Array) -> Float32Array:
+    """(m, k) differences in the channel of (m, k, 3) that differs most inside, positive there."""
+    inside = (along < 0) & (along >= -_SIDE)
+    within = signed[:, inside].mean(1)
     channel = np.abs(within).argmax(1)[:, None]
     sign = np.sign(np.take_along_axis(within, channel, 1))
-    profile = np.take_along_axis(signed, channel[:, None], 2)[..., 0] * sign
-    return profile, sign[:, 0]
+    return np.take_along_axis(signed, channel[:, None], 2)[..., 0] * sign
 
 
 def _steps(profile: Float32Array, near: int) -> Array:
@@ -233,14 +225,16 @@ def _steps(profile: Float32Array, near: int) -> Array:
     return (before - after) / near
 
 
-def _crossing(differs: Float32Array, best: IntArray, level: Array) -> Array:
-    """(m,) place nearest to `best` at which `differs` falls below a level, or NaN."""
+def _crossing(profile: Float32Array, best: IntArray, side: int) -> Array:
+    """(m,) place nearest to `best` at which a profile falls to its middle there, or NaN."""
+    beside = _beside(profile, best, side + 1)
+    level = (beside[:, :side].mean(1) + beside[:, -side:].mean(1)) / 2
     rows = np.arange(len(best))
     place = np.full(len(best), np.nan)
     for k in (0, -1, 1, -2, 2, -3):
-        a = np.clip(best + k, 0, differs.shape[1] - 2)
-        high = differs[rows, a]
-        low = differs[rows, a + 1]
+        a = np.clip(best + k, 0, profile.shape[1] - 2)
+        high = profile[rows, a]
+        low = profile[rows, a + 1]
         falls = np.isnan(place) & (high >= level) & (low < level)
         share = (high - level) / np.maximum(high - low, 1e-6)
         place = np.where(falls, a + share, place)

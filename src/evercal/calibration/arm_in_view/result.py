@@ -7,7 +7,14 @@ import cv2
 import numpy as np
 
 from evercal.calibration.arm_in_view.covariance import SCATTER, halves, in_base, parts
-from evercal.calibration.arm_in_view.fit import FOCAL, JOINTS, LENS, ArmFit, Fitter
+from evercal.calibration.arm_in_view.fit import (
+    FOCAL,
+    JOINTS,
+    LENS,
+    POSE,
+    ArmFit,
+    Fitter,
+)
 from evercal.calibration.calibration import Calibration, ErrorTerm
 from evercal.calibration.checks import Checks
 from evercal.calibration.framed_pose import ImageUse, JointOffset
@@ -49,14 +56,16 @@ def calibration_of(
         terms.append(ErrorTerm.of(f"offset of joint {name}", added, "arm"))
     apart = halves(fit)
     # Halves differ by twice the error of the whole.
-    d2 = apart @ np.linalg.pinv(4 * _of_images(fit, whole)) @ apart
+    scatter = whole[SCATTER][0][POSE, POSE]
+    d2 = apart @ np.linalg.pinv(4 * scatter) @ apart
     if d2 > _HALVES_D2:
         added = of_pose * (d2 / _HALVES_D2 - 1)
         of_pose = of_pose + added
         terms.append(ErrorTerm.of("distance of halves of the images", added, "images"))
     stated = frames[0].camera
     estimated = stated.changed(fit.estimate.parameters[LENS])
-    return Calibration(
+    warnings = warnings_of(fit, fitter)
+    calibration = Calibration(
         "eye_to_hand",
         fit.estimate.camera_from_base.inverse(),
         of_pose,
@@ -65,23 +74,16 @@ def calibration_of(
         lenses={"stated": stated, "estimated": estimated},
         images=_uses(fit, frames),
         error_terms=tuple(terms),
-        checks=_checks(fit, apart),
+        checks=_checks(fit, apart, warnings),
         joints=_joints(fit, fitter, covariance),
         joint_covariance=covariance[JOINTS:, JOINTS:],
-        source={"command": "arm-in-view", "frames": len(frames)},
+        source={
+            "command": "arm-in-view",
+            "frames": len(frames),
+            "links_not_shown": links_not_shown(fit, fitter),
+        },
     )
-
-
-def with_verdict(calibration: Calibration, warnings: Sequence[str]) -> Calibration:
-    """The calibration with what the data contradict, and a verdict."""
-    checks = replace(calibration.checks, warnings=[*warnings])
-    calibration = replace(calibration, checks=checks)
     return replace(calibration, verdict=verdict_of(calibration, warnings, ""))
-
-
-def _of_images(fit: ArmFit, whole: dict[str, tuple[Array, str]]) -> Array:
-    scatter, _ = whole[SCATTER]
-    return scatter[:6, :6]
 
 
 def _turns_of_base(fit: ArmFit, fitter: Fitter) -> dict[str, Array]:
@@ -123,7 +125,7 @@ def _mm_per_px(fit: ArmFit) -> float:
     return 1000 / float(np.median(np.linalg.norm(across, axis=1)))
 
 
-def _checks(fit: ArmFit, apart: Array) -> Checks:
+def _checks(fit: ArmFit, apart: Array, warnings: Sequence[str]) -> Checks:
     mm, deg = length_mm_deg(apart)
     return Checks(
         images_given=len(fit.equations.testable),
@@ -131,6 +133,7 @@ def _checks(fit: ArmFit, apart: Array) -> Checks:
         repeatability_deg=deg,
         outline_confirmed=fit.confirmed,
         outline_sigma_px=fit.scale_px,
+        warnings=warnings,
     )
 
 

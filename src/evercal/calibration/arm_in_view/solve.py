@@ -16,8 +16,6 @@ from evercal.calibration.arm_in_view.fit import (
 from evercal.calibration.arm_in_view.result import (
     LEAST_CONFIRMED,
     calibration_of,
-    warnings_of,
-    with_verdict,
 )
 from evercal.calibration.arm_in_view.starts import Overlap, starts
 from evercal.calibration.arm_in_view.views import ArmViews
@@ -30,7 +28,6 @@ from evercal.robot.frame_names import FrameNames
 from evercal.robot.link_shapes import RobotBody, robot_body
 from evercal.robot.pose_errors import ArmErrors
 from evercal.robot.robot_model import RobotModel
-from evercal.typing import Array
 
 NOT_RECOGNISED = (
     "the arm was not recognised in the images: is this the URDF of the robot, and are these its"
@@ -39,7 +36,7 @@ NOT_RECOGNISED = (
 LEAST_IMAGES = 3
 """Least number of images."""
 MOST_IMAGES = 40
-"""Images that are used; more of them are chosen by the motion of the joints."""
+"""Images that are used; of more, some from beginning to end."""
 _SLIDING_M = 0.5
 """Offset of a sliding joint for a radian of others."""
 DOUBTFUL_LENS = 1.8
@@ -91,12 +88,11 @@ def calibrate_arm_in_view(
     priors = priors_of(body, errors or ArmErrors())
     fit = fit_arm(fitter, priors, start, on_progress)
     names = FrameNames(body.base, "", recording.frames.camera)
-    calibration = calibration_of(fit, fitter, frames, names)
-    return with_verdict(calibration, warnings_of(fit, fitter))
+    return calibration_of(fit, fitter, frames, names)
 
 
 def chosen_frames(recording: Recording) -> list[Frame]:
-    """Frames with joint values, at most `MOST_IMAGES`, with the arm at places far apart."""
+    """Frames with joint values, at most `MOST_IMAGES`."""
     frames = [frame for frame in recording.train if frame.joints_rad is not None]
     if recording.arm is None or not frames:
         raise InputError(
@@ -113,29 +109,19 @@ def chosen_frames(recording: Recording) -> list[Frame]:
         raise InputError(
             f"{recording.name}: its images differ in size; give one camera's"
         )
-    values = np.array([frame.joints_rad for frame in frames])
-    return [frames[i] for i in far_apart(values, MOST_IMAGES)]
-
-
-def far_apart(values: Array, most: int) -> list[int]:
-    """Rows of (n, k) that are far from each other, in their order."""
-    chosen = [0]
-    distance = np.linalg.norm(values - values[0], axis=1)
-    while len(chosen) < min(most, len(values)):
-        chosen.append(int(distance.argmax()))
-        other = np.linalg.norm(values - values[chosen[-1]], axis=1)
-        distance = np.minimum(distance, other)
-    return sorted({*chosen})
+    return [frames[i] for i in spread(len(frames), MOST_IMAGES)]
 
 
 def priors_of(body: RobotBody, errors: ArmErrors) -> Priors:
     """Priors of the offsets of joints; those of first joints turn the base, and stay 0."""
     sigma = np.zeros(len(body.joints))
+    longest = max(body.arms, key=lambda arm: len(arm.chain))
+    slopes = longest.slopes(np.zeros((1, len(longest.joints))))
+    rad = errors.offset_rad(slopes)
     for arm in body.arms:
         for joint in arm.chain[1:]:
             name = arm.joints[joint.value]
             if name in body.joints:
-                rad = errors.offset_rad(np.zeros((1, 6, 1)))
                 lever_m = 1.0 if joint.rotates else _SLIDING_M
                 sigma[body.joints.index(name)] = rad * lever_m
     return Priors(usual=sigma)
