@@ -75,7 +75,15 @@ def images(body: RobotBody, values: np.ndarray, seed: int = 0) -> list[np.ndarra
     return shots
 
 
-def write(folder: Path, count: int = 10, seed: int = 0) -> SE3:
+def seen_by(camera: Camera, image: np.ndarray) -> np.ndarray:
+    """An image of `CAMERA` as a camera with distortion takes it."""
+    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = camera.unproject(np.stack([x, y], -1).astype(float))
+    pixels = CAMERA.project(rays).astype(np.float32)
+    return cv2.remap(image, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR)
+
+
+def write(folder: Path, count: int = 10, seed: int = 0, camera: Camera = CAMERA) -> SE3:
     """Write a recording, and return base_from_camera."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "robot.urdf").write_text(urdf())
@@ -83,11 +91,9 @@ def write(folder: Path, count: int = 10, seed: int = 0) -> SE3:
     body = robot_body(RobotModel(folder / "robot.urdf"), NAMES)
     rows = ["image," + ",".join(NAMES)]
     for i, image in enumerate(images(body, values, seed)):
-        cv2.imwrite(str(folder / f"{i:03d}.png"), image)
+        taken = image if camera == CAMERA else seen_by(camera, image)
+        cv2.imwrite(str(folder / f"{i:03d}.png"), taken)
         rows.append(f"{i:03d}.png," + ",".join(f"{value:.9f}" for value in values[i]))
     (folder / "joints.csv").write_text("\n".join(rows) + "\n")
-    camera = {
-        k: getattr(CAMERA, k) for k in ("width", "height", "fx", "fy", "cx", "cy")
-    }
-    (folder / "camera.json").write_text(json.dumps(camera))
+    (folder / "camera.json").write_text(json.dumps(camera.to_dict()))
     return BASE_FROM_CAMERA

@@ -1,7 +1,9 @@
 """A fixed camera by an arm of boxes in its images."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from evercal.calibration.arm_in_view.fit import Fitter
@@ -46,6 +48,49 @@ def test_the_camera_is_estimated_without_a_start(cell: Path) -> None:
         calibration.uncertain_pose.squared_mahalanobis(arm_cell.BASE_FROM_CAMERA) < 17
     )
     assert calibration.sigma_mm < 4
+
+
+def test_a_wide_lens(tmp_path: Path) -> None:
+    """0.3 mm; 15 mm if its distortion is not stated."""
+    lens = replace(arm_cell.CAMERA, distortion=(-0.25, 0.06, 0.0, 0.0))
+    arm_cell.write(tmp_path, camera=lens)
+    found = _calibrated(tmp_path).parent_from_child
+    assert pose_distance_mm_deg(found, arm_cell.BASE_FROM_CAMERA)[0] < 3
+
+
+@pytest.mark.parametrize("factor", [0.97, 1.03])
+def test_a_wrong_focal_length_is_estimated(cell: Path, factor: float) -> None:
+    """3 % of it are 40 mm at this distance."""
+    options = ReadOptions(whole_robot=True)
+    recording = load_recording(cell, None, None, options)
+    frames = tuple(
+        replace(frame, camera=frame.camera.zoomed(factor)) for frame in recording.train
+    )
+    model = RobotModel(cell / "robot.urdf")
+    calibration = calibrate_arm_in_view(replace(recording, train=frames), model)
+    truth = arm_cell.BASE_FROM_CAMERA
+    assert pose_distance_mm_deg(calibration.parent_from_child, truth)[0] < 15
+    assert calibration.uncertain_pose.squared_mahalanobis(truth) < 20
+    assert "focal length" in calibration.verdict
+
+
+def test_offsets_of_joints_are_estimated(cell: Path) -> None:
+    """Of the elbow, 1 deg."""
+    options = ReadOptions(whole_robot=True)
+    recording = load_recording(cell, None, None, options)
+    off = np.radians([0, 0, 1, 0])
+    frames = []
+    for frame in recording.train:
+        assert frame.joints_rad is not None
+        values = tuple((np.array(frame.joints_rad) - off).tolist())
+        frames.append(replace(frame, joints_rad=values))
+    model = RobotModel(cell / "robot.urdf")
+    moved = replace(recording, train=tuple(frames))
+    calibration = calibrate_arm_in_view(moved, model)
+    offsets = np.degrees([joint.offset for joint in calibration.joints])
+    assert offsets == pytest.approx([0, 0, 1, 0], abs=0.2)
+    truth = arm_cell.BASE_FROM_CAMERA
+    assert pose_distance_mm_deg(calibration.parent_from_child, truth)[0] < 4
 
 
 def test_joint_values_of_other_images_are_refused(cell: Path, tmp_path: Path) -> None:

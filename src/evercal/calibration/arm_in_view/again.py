@@ -16,6 +16,17 @@ def calibrated_again(
     without = reference.source.get("without", ())
     start = reference.parent_from_child
     try:
-        return calibrate_arm_in_view(recording, model, None, without, start)
+        return calibrate_arm_in_view(
+            recording,
+            model,
+            None,
+            without,
+            start,
+        )
     except InputError:
-        return calibrate_arm_in_view(recording, model, None, without)
+        return calibrate_arm_in_view(
+            recording,
+            model,
+            None,
+            without,
+        )

@@ -19,7 +19,7 @@ from evercal.calibration.arm_in_view.fit import (
     ArmFit,
 )
 from evercal.geometry import in_parent_axes
-from evercal.typing import Array, BoolArray
+from evercal.typing import Array, BoolArray, IntArray
 
 _SHARED = {
     "intrinsics": (LENS, "lens"),
@@ -53,7 +53,16 @@ def parts(fit: ArmFit, free: BoolArray | None = None) -> dict[str, tuple[Array, 
     sigma = fit.priors.sigma()
     least = LEAST_REPEATS / fit.repeats * fit.information()[np.ix_(free, free)]
     scatter = inverse @ (fit.scatter(free) + least) @ inverse
-    found = {SCATTER: (_whole(scatter, columns, len(sigma)), "images")}
+    found = {
+        SCATTER: (
+            _whole(
+                scatter,
+                columns,
+                len(sigma),
+            ),
+            "images",
+        )
+    }
     by_lens = inverse @ fit.information()[np.ix_(columns, np.arange(len(sigma))[LENS])]
     for name, (own, cause) in _SHARED.items():
         precision = np.zeros(len(sigma))
@@ -61,13 +70,22 @@ def parts(fit: ArmFit, free: BoolArray | None = None) -> dict[str, tuple[Array, 
         added = inverse @ np.diag(precision[free]) @ inverse
         if cause == "lens":
             added = added + by_lens @ lens @ by_lens.T
-        found[name] = (_whole(added, columns, len(sigma)), cause)
+        found[name] = (
+            _whole(
+                added,
+                columns,
+                len(sigma),
+            ),
+            cause,
+        )
     return found
 
 
 def lens_covariance(fit: ArmFit) -> Array:
     """(3, 3) of focal length and principal point, by their prior and the images."""
-    return sum(part for part, _ in parts(fit, _with_lens(fit)).values())[LENS, LENS]
+    with_lens = parts(fit, _with_lens(fit))
+    covariance = np.sum([part for part, _ in with_lens.values()], 0)
+    return covariance[LENS, LENS]
 
 
 def focal_sigmas(fit: ArmFit) -> float:
@@ -96,7 +114,7 @@ def halves(fit: ArmFit) -> Array:
     return (fit.step(fit.free, is_odd) - fit.step(fit.free, ~is_odd))[POSE]
 
 
-def _whole(covariance: Array, columns: Array, count: int) -> Array:
+def _whole(covariance: Array, columns: IntArray, count: int) -> Array:
     whole = np.zeros((count, count))
     whole[np.ix_(columns, columns)] = covariance
     return whole

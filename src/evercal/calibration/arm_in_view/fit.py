@@ -112,7 +112,11 @@ class Estimate:
         change[POSE] = 0
         camera = self.camera.changed(change[LENS]).pinhole
         camera_from_base = SE3.exp(pose) @ self.camera_from_base
-        return Estimate(camera_from_base, camera, self.parameters + change)
+        return Estimate(
+            camera_from_base,
+            camera,
+            self.parameters + change,
+        )
 
 
 class Equations(NamedTuple):
@@ -236,24 +240,53 @@ class Fitter:
         offsets is estimated.
         """
         estimate = start
+        fit = None
         for number, reach in enumerate(reaches_px):
             values = self.views.values + estimate.offsets
             frames = self.views.body.frames(values)
             slopes = self.views.body.slopes(values)
             drawings = [self.draw(estimate, frames[:, i]) for i in images]
             if number in learn_at:
-                self._learn(images, drawings, reach)
+                self._learn(
+                    images,
+                    drawings,
+                    reach,
+                )
             edges = self._edges if learn_at else self._rough_edges
-            search = Search(edges, reach, spacing_px)
+            search = Search(
+                edges,
+                reach,
+                spacing_px,
+            )
             rows = []
-            for i, drawing in zip(images, drawings, strict=True):
-                shown = Shown(i, frames[:, i], slopes[:, i], drawing)
-                rows.append(self._rows(estimate, shown, search))
+            for i, drawing in zip(
+                images,
+                drawings,
+                strict=True,
+            ):
+                shown = Shown(
+                    i,
+                    frames[:, i],
+                    slopes[:, i],
+                    drawing,
+                )
+                rows.append(
+                    self._rows(
+                        estimate,
+                        shown,
+                        search,
+                    )
+                )
             equations = Equations(*map(np.concatenate, zip(*rows, strict=True)))
-            fit = solved(estimate, equations, priors)
+            fit = solved(
+                estimate,
+                equations,
+                priors,
+            )
             estimate = fit.estimate
             if learn_at and number >= max(learn_at):
                 priors = priors.of_this_arm(fit)
+        assert fit, "there is at least one step"
         return fit
 
     def reach_m(self) -> float:
@@ -267,7 +300,11 @@ class Fitter:
     def start(self, camera_from_base: SE3) -> Estimate:
         """A start with the stated camera and joint values."""
         count = JOINTS + len(self.views.body.joints)
-        return Estimate(camera_from_base, self.views.camera, np.zeros(count))
+        return Estimate(
+            camera_from_base,
+            self.views.camera,
+            np.zeros(count),
+        )
 
     def draw(self, estimate: Estimate, base_from_link: Array) -> Drawing:
         """Draw the arm with link poses (links, 4, 4)."""
@@ -281,7 +318,11 @@ class Fitter:
 
         covered = np.ones(self.views.images.shape[:3], bool)
         side = 2 * max(round(reach), 3) + 1
-        for i, drawing in zip(images, drawings, strict=True):
+        for i, drawing in zip(
+            images,
+            drawings,
+            strict=True,
+        ):
             arm = (drawing.links >= 0).astype(np.uint8)
             covered[i] = cv2.dilate(arm, np.ones((side, side), np.uint8)) > 0
         self.views.learn_background(covered)
@@ -294,17 +335,37 @@ class Fitter:
             search.edges, links, camera, shown.drawing, search.spacing_px
         )
         points = points.at(self.moving[points.link])
-        offsets = image_offsets(self.views, shown.number, points, search.reach_px)
+        offsets = image_offsets(
+            self.views,
+            shown.number,
+            points,
+            search.reach_px,
+        )
         count = len(self._edges)
         testable = np.bincount(points.link[offsets.testable], minlength=count)
+        testable = testable.astype(float)
         points = points.at(offsets.confirmed)
         px = offsets.px[offsets.confirmed]
         owner = np.full(len(px), shown.number)
-        by_link = links[:, :3, :3] @ shown.slopes.reshape(count, 2, 3, -1).swapaxes(
-            0, 1
+        by_link = links[:, :3, :3] @ shown.slopes.reshape(
+            count,
+            2,
+            3,
+            -1,
+        ).swapaxes(0, 1)
+        slopes = outline_slopes(
+            points,
+            camera,
+            links,
+            by_link,
         )
-        slopes = outline_slopes(points, camera, links, by_link)
-        return Equations(slopes, px, owner, points.link, testable[None])
+        return Equations(
+            slopes,
+            px,
+            owner,
+            points.link,
+            testable[None],
+        )
 
 
 def outline_slopes(
@@ -331,8 +392,16 @@ def outline_slopes(
             focal[:, None],
             points.normals,
             np.ones((len(z), 1)),
-            np.einsum("mck,mc->mk", shift, by_point)
-            + np.einsum("mck,mc->mk", turn, by_turn),
+            np.einsum(
+                "mck,mc->mk",
+                shift,
+                by_point,
+            )
+            + np.einsum(
+                "mck,mc->mk",
+                turn,
+                by_turn,
+            ),
         ],
         1,
     )
@@ -342,7 +411,11 @@ def moving_links(views: ArmViews) -> BoolArray:
     """(links,) whether the motion of a link uncovers what is behind it."""
     frames = views.body.frames(views.values)
     moving = []
-    for shape, poses in zip(views.body.links, frames, strict=True):
+    for shape, poses in zip(
+        views.body.links,
+        frames,
+        strict=True,
+    ):
         corners = np.stack([shape.vertices.min(0), shape.vertices.max(0)])
         middle = corners.mean(0) @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, :3, 3]
         size = np.linalg.norm(np.ptp(corners, 0))
@@ -362,7 +435,15 @@ def solved(estimate: Estimate, equations: Equations, priors: Priors) -> ArmFit:
         raise TooFewPoints
     scale = max(LEAST_SCALE_PX, 1.4826 * float(np.median(np.abs(px))))
     weights = 1 / (1 + (px / (2 * scale)) ** 2) ** 2
-    fit = ArmFit(estimate, equations, weights, scale, 1.0, free, priors)
+    fit = ArmFit(
+        estimate,
+        equations,
+        weights,
+        scale,
+        1.0,
+        free,
+        priors,
+    )
     information = fit.information()[np.ix_(free, free)]
     scatter = fit.scatter(free)
     ridge = 1e-9 * np.diag(np.diag(information))
@@ -374,7 +455,11 @@ def solved(estimate: Estimate, equations: Equations, priors: Priors) -> ArmFit:
 def _of_clusters(gradients: Array, owners: IntArray) -> Array:
     _, number = np.unique(owners, return_inverse=True)
     sums = np.zeros((number.max() + 1, gradients.shape[1]))
-    np.add.at(sums, number, gradients)
+    np.add.at(
+        sums,
+        number,
+        gradients,
+    )
     sums -= sums.mean(0)
     return sums.T @ sums * len(sums) / max(len(sums) - 1, 1)
 

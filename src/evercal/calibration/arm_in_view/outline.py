@@ -62,7 +62,13 @@ class OutlinePoints(NamedTuple):
 
     def at(self, chosen: BoolArray) -> "OutlinePoints":
         """Some of the points."""
-        return OutlinePoints(*(values[chosen] for values in self))
+        return OutlinePoints(
+            self.link[chosen],
+            self.on_link[chosen],
+            self.in_camera[chosen],
+            self.pixels[chosen],
+            self.normals[chosen],
+        )
 
 
 def link_edges(shape: LinkShape) -> LinkEdges:
@@ -79,7 +85,12 @@ def link_edges(shape: LinkShape) -> LinkEdges:
     # The face of the last half edge is the other one.
     faces[edge.ravel(), 1] = owners
     faces[count != 2, 1] = faces[count != 2, 0]
-    return LinkEdges(shape, unit_vectors(sides), edges, faces)
+    return LinkEdges(
+        shape,
+        unit_vectors(sides),
+        edges,
+        faces,
+    )
 
 
 def outline_points(
@@ -93,18 +104,35 @@ def outline_points(
     parts = []
     for number, link in enumerate(edges):
         pose = camera_from_link[number]
-        on_link, along = _sampled(link, pose, camera, spacing_px)
+        on_link, along = _sampled(
+            link,
+            pose,
+            camera,
+            spacing_px,
+        )
         in_camera = on_link @ pose[:3, :3].T + pose[:3, 3]
         pixels = camera.project(in_camera)
         normals = np.stack([-along[:, 1], along[:, 0]], 1)
         owner = np.full(len(on_link), number)
-        parts.append(OutlinePoints(owner, on_link, in_camera, pixels, normals))
+        parts.append(
+            OutlinePoints(
+                owner,
+                on_link,
+                in_camera,
+                pixels,
+                normals,
+            )
+        )
     points = OutlinePoints(*map(np.concatenate, zip(*parts, strict=True)))
     right = _link_at(drawing, points.pixels + _BESIDE_PX * points.normals)
     left = _link_at(drawing, points.pixels - _BESIDE_PX * points.normals)
     outwards = (right == -1) & (left == points.link)
     inwards = (left == -1) & (right == points.link)
-    sign = np.where(inwards, -1.0, 1.0)
+    sign = np.where(
+        inwards,
+        -1.0,
+        1.0,
+    )
     points = points._replace(normals=points.normals * sign[:, None])
     return points.at(outwards | inwards)
 
@@ -129,7 +157,11 @@ def _sampled(
     length = length[usable]
     reached = np.cumsum(length)
     total = reached[-1] if len(reached) else 0.0
-    at = np.arange(spacing_px / 2, total, spacing_px)
+    at = np.arange(
+        spacing_px / 2,
+        total,
+        spacing_px,
+    )
     edge = np.searchsorted(reached, at)
     share = (reached[edge] - at) / length[edge]
     points = ends[edge, 1] + share[:, None] * (ends[edge, 0] - ends[edge, 1])
@@ -163,46 +195,97 @@ def image_offsets(
     """Find where image `i` ends to differ from the background, along the normals of points."""
     if not len(points.link):  # the arm is beside the image
         none = np.zeros(0)
-        return Offsets(none, none > 0, none > 0)
+        return Offsets(
+            none,
+            none > 0,
+            none > 0,
+        )
     is_fine = reach_px <= _FINE_PX
     step = 0.5 if is_fine else 1.0
     end = reach_px + _AROUND
-    along = np.arange(-end, end + step / 2, step)
+    along = np.arange(
+        -end,
+        end + step / 2,
+        step,
+    )
     grid = points.pixels[:, None] + along[:, None] * points.normals[:, None]
     differs = _sampled_at(views.difference[i], grid)
     known = _sampled_at(views.known.astype(np.float32), grid) > 0.99
-    like = np.clip(differs / (_CONTRAST * views.noise) - 1, -1, 1) * known
+    like = (
+        np.clip(
+            differs / (_CONTRAST * views.noise) - 1,
+            -1,
+            1,
+        )
+        * known
+    )
     if is_fine:
         profile = _profile(_sampled_at(views.signed(i), grid), along)
         side = round(_SIDE / step)
-        best = _best(_steps(profile, side), along, reach_px)
-        crossing = _crossing(profile, best, side)
+        best = _best(
+            _steps(profile, side),
+            along,
+            reach_px,
+        )
+        crossing = _crossing(
+            profile,
+            best,
+            side,
+        )
     else:
         # The best end of the arm: like it before, unlike it after.
         total = np.cumsum(like, 1)
-        best = _best(2 * total - total[:, -1:], along, reach_px)
+        best = _best(
+            2 * total - total[:, -1:],
+            along,
+            reach_px,
+        )
         crossing = best + 0.5
     px = along[0] + step * crossing
     near = round(_AROUND / step)
     blurred = round(_BLURRED / step)
-    around = _beside(like, best, near)
+    around = _beside(
+        like,
+        best,
+        near,
+    )
     confirmed = np.isfinite(px) & (np.abs(px) <= reach_px)
     confirmed &= around[:, : near - blurred].mean(1) > _INSIDE
     confirmed &= around[:, near + blurred + 1 :].mean(1) < _OUTSIDE
-    testable = known[:, np.abs(along) <= _AROUND].all(1)
-    return Offsets(np.where(confirmed, px, 0.0), confirmed, testable)
+    testable = np.all(known[:, np.abs(along) <= _AROUND], 1)
+    return Offsets(
+        np.where(
+            confirmed,
+            px,
+            0.0,
+        ),
+        confirmed,
+        testable,
+    )
 
 
 def _beside(values: Array, at: IntArray, near: int) -> Array:
     """(m, 2 near + 1) values (m, k) around samples (m,)."""
     window = at[:, None] + np.arange(-near, near + 1)
-    window = np.clip(window, 0, values.shape[1] - 1)
-    return np.take_along_axis(values, window, 1)
+    window = np.clip(
+        window,
+        0,
+        values.shape[1] - 1,
+    )
+    return np.take_along_axis(
+        values,
+        window,
+        1,
+    )
 
 
 def _best(score: Array, along: Array, reach_px: float) -> IntArray:
     """(m,) sample with the largest score (m, k) within reach."""
-    return np.where(np.abs(along) <= reach_px, score, -np.inf).argmax(1)
+    return np.where(
+        np.abs(along) <= reach_px,
+        score,
+        -np.inf,
+    ).argmax(1)
 
 
 def _profile(signed: Float32Array, along: Array) -> Float32Array:
@@ -210,14 +293,35 @@ def _profile(signed: Float32Array, along: Array) -> Float32Array:
     inside = (along < 0) & (along >= -_SIDE)
     within = signed[:, inside].mean(1)
     channel = np.abs(within).argmax(1)[:, None]
-    sign = np.sign(np.take_along_axis(within, channel, 1))
-    return np.take_along_axis(signed, channel[:, None], 2)[..., 0] * sign
+    sign = np.sign(
+        np.take_along_axis(
+            within,
+            channel,
+            1,
+        )
+    )
+    return (
+        np.take_along_axis(
+            signed,
+            channel[:, None],
+            2,
+        )[..., 0]
+        * sign
+    )
 
 
 def _steps(profile: Float32Array, near: int) -> Array:
     """(m, k) mean of `near` samples before each, minus that of as many after it."""
-    total = np.cumsum(profile, 1, dtype=float)
-    total = np.pad(total, ((0, 0), (near + 1, near)), mode="edge")
+    total = np.cumsum(
+        profile,
+        1,
+        dtype=float,
+    )
+    total = np.pad(
+        total,
+        ((0, 0), (near + 1, near)),
+        mode="edge",
+    )
     total[:, : near + 1] = 0
     count = profile.shape[1]
     before = total[:, near : near + count] - total[:, :count]
@@ -227,21 +331,44 @@ def _steps(profile: Float32Array, near: int) -> Array:
 
 def _crossing(profile: Float32Array, best: IntArray, side: int) -> Array:
     """(m,) place nearest to `best` at which a profile falls to its middle there, or NaN."""
-    beside = _beside(profile, best, side + 1)
+    beside = _beside(
+        profile,
+        best,
+        side + 1,
+    )
     level = (beside[:, :side].mean(1) + beside[:, -side:].mean(1)) / 2
     rows = np.arange(len(best))
     place = np.full(len(best), np.nan)
     for k in (0, -1, 1, -2, 2, -3):
-        a = np.clip(best + k, 0, profile.shape[1] - 2)
+        a = np.clip(
+            best + k,
+            0,
+            profile.shape[1] - 2,
+        )
         high = profile[rows, a]
         low = profile[rows, a + 1]
         falls = np.isnan(place) & (high >= level) & (low < level)
         share = (high - level) / np.maximum(high - low, 1e-6)
-        place = np.where(falls, a + share, place)
+        place = np.where(
+            falls,
+            a + share,
+            place,
+        )
     return place
 
 
 def _sampled_at(image: Float32Array, grid: Array) -> Float32Array:
     """Values of an image (h, w) at pixels (m, k, 2); 0 outside."""
-    x, y = np.moveaxis(grid, -1, 0).astype(np.float32)
-    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    x, y = np.moveaxis(
+        grid,
+        -1,
+        0,
+    ).astype(np.float32)
+    values = cv2.remap(
+        image,
+        x,
+        y,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+    )
+    return np.asarray(values, np.float32)

@@ -48,12 +48,22 @@ def calibration_of(
     covariance = sum((part for part, _ in whole.values()), np.zeros(()))
     of_pose = in_base(fit, covariance)
     terms = [
-        ErrorTerm.of(name, in_base(fit, part), cause)
+        ErrorTerm.of(
+            name,
+            in_base(fit, part),
+            cause,
+        )
         for name, (part, cause) in whole.items()
     ]
     for name, added in _turns_of_base(fit, fitter).items():
         of_pose = of_pose + added
-        terms.append(ErrorTerm.of(f"offset of joint {name}", added, "arm"))
+        terms.append(
+            ErrorTerm.of(
+                f"offset of joint {name}",
+                added,
+                "arm",
+            )
+        )
     apart = halves(fit)
     # Halves differ by twice the error of the whole.
     scatter = whole[SCATTER][0][POSE, POSE]
@@ -61,7 +71,13 @@ def calibration_of(
     if d2 > _HALVES_D2:
         added = of_pose * (d2 / _HALVES_D2 - 1)
         of_pose = of_pose + added
-        terms.append(ErrorTerm.of("distance of halves of the images", added, "images"))
+        terms.append(
+            ErrorTerm.of(
+                "distance of halves of the images",
+                added,
+                "images",
+            )
+        )
     stated = frames[0].camera
     estimated = stated.changed(fit.estimate.parameters[LENS])
     warnings = warnings_of(fit, fitter)
@@ -74,8 +90,16 @@ def calibration_of(
         lenses={"stated": stated, "estimated": estimated},
         images=_uses(fit, frames),
         error_terms=tuple(terms),
-        checks=_checks(fit, apart, warnings),
-        joints=_joints(fit, fitter, covariance),
+        checks=_checks(
+            fit,
+            apart,
+            warnings,
+        ),
+        joints=_joints(
+            fit,
+            fitter,
+            covariance,
+        ),
         joint_covariance=covariance[JOINTS:, JOINTS:],
         source={
             "command": "arm-in-view",
@@ -83,7 +107,14 @@ def calibration_of(
             "links_not_shown": links_not_shown(fit, fitter),
         },
     )
-    return replace(calibration, verdict=verdict_of(calibration, warnings, ""))
+    return replace(
+        calibration,
+        verdict=verdict_of(
+            calibration,
+            warnings,
+            "",
+        ),
+    )
 
 
 def _turns_of_base(fit: ArmFit, fitter: Fitter) -> dict[str, Array]:
@@ -112,10 +143,23 @@ def _uses(fit: ArmFit, frames: Sequence[Frame]) -> tuple[ImageUse, ...]:
         rows = equations.image == i
         name = frame.name
         if not rows.any():
-            uses.append(ImageUse(name, False, "its outlines are not those of the arm"))
+            uses.append(
+                ImageUse(
+                    name,
+                    False,
+                    "its outlines are not those of the arm",
+                )
+            )
             continue
         px = float(np.median(np.abs(equations.px[rows])))
-        uses.append(ImageUse(name, True, "", px * _mm_per_px(fit)))
+        uses.append(
+            ImageUse(
+                name,
+                True,
+                "",
+                px * _mm_per_px(fit),
+            )
+        )
     return tuple(uses)
 
 
@@ -141,7 +185,13 @@ def _joints(fit: ArmFit, fitter: Fitter, covariance: Array) -> tuple[JointOffset
     body = fitter.views.body
     rotates = {}
     for arm in body.arms:
-        rotates |= dict(zip(arm.joints, arm.rotates().tolist(), strict=True))
+        rotates |= dict(
+            zip(
+                arm.joints,
+                arm.rotates().tolist(),
+                strict=True,
+            )
+        )
     rows = []
     for k, name in enumerate(body.joints):
         why = ""
@@ -152,7 +202,15 @@ def _joints(fit: ArmFit, fitter: Fitter, covariance: Array) -> tuple[JointOffset
         elif sigma > 0.7 * prior:
             why = f"move {name} and the joints after it more between the images"
         offset = float(fit.estimate.offsets[k])
-        rows.append(JointOffset(name, offset, sigma, rotates.get(name, True), why))
+        rows.append(
+            JointOffset(
+                name,
+                offset,
+                sigma,
+                rotates.get(name, True),
+                why,
+            )
+        )
     return tuple(rows)
 
 
@@ -183,7 +241,11 @@ def links_not_shown(fit: ArmFit, fitter: Fitter) -> list[str]:
     """Names of links whose outlines the images do not show."""
     links = fitter.views.body.links
     testable = fit.equations.testable.sum(0)
-    shown = np.bincount(fit.equations.link, fit.weights, minlength=len(links))
+    shown = np.bincount(
+        fit.equations.link,
+        fit.weights,
+        minlength=len(links),
+    )
     is_lost = shown < _LINK_SHOWN * fit.confirmed * testable
     is_lost &= testable >= _LINK_POINTS
     return [links[k].link for k in np.flatnonzero(is_lost)]

@@ -63,7 +63,12 @@ class Overlap:
         for outline in pixels[np.isfinite(pixels).all((1, 2))]:
             hull = cv2.convexHull(outline.astype(np.float32))
             parts = np.rint(hull * _PARTS).astype(np.int32)
-            cv2.fillConvexPoly(arm, parts, 1, shift=_SHIFT)
+            cv2.fillConvexPoly(
+                arm,
+                parts,
+                1,
+                shift=_SHIFT,
+            )
         return arm
 
 
@@ -77,9 +82,17 @@ def starts(overlap: Overlap, reach_m: float) -> list[SE3]:
     """camera_from_base of starts, the best first."""
     enough = overlap.masks.sum((1, 2))
     images = np.flatnonzero(enough > 0.3 * np.median(enough))
-    candidates = _grid(overlap, images, reach_m)
+    candidates = _grid(
+        overlap,
+        images,
+        reach_m,
+    )
     poses = [pose for _, pose in sorted(candidates, key=lambda item: item[0])]
-    for most, number in zip(_DRAWN, _IMAGES, strict=True):
+    for most, number in zip(
+        _DRAWN,
+        _IMAGES,
+        strict=True,
+    ):
         some = images[spread(len(images), number)]
         scored = [(overlap.score(pose, some), pose) for pose in poses[:most]]
         scored.sort(key=lambda item: -item[0])
@@ -126,7 +139,11 @@ def _rotations() -> Iterator[Array]:
     azimuths = np.arange(_AZIMUTHS) * 2 * np.pi / _AZIMUTHS
     elevations = np.deg2rad(_ELEVATIONS_DEG)
     rolls = np.deg2rad(_ROLLS_DEG)
-    for azimuth, elevation, roll in product(azimuths, elevations, rolls):
+    for azimuth, elevation, roll in product(
+        azimuths,
+        elevations,
+        rolls,
+    ):
         flat = np.cos(elevation)
         towards = [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)]
         forward = -np.array(towards)
