@@ -6,7 +6,7 @@ from dataclasses import replace
 from unittest import mock
 
 from evercal.calibration.arm_in_view import solve
-from evercal.calibration.arm_in_view.fit import Priors
+from evercal.calibration.arm_in_view.equations import Priors
 from evercal.robot.link_shapes import RobotBody, robot_body
 
 _ROUGH_M = 0.003
@@ -35,7 +35,6 @@ PARTS: dict[str, tuple[str, object]] = {
     "intrinsics always estimated": ("priors_of", _with_priors(lens_is_free=True)),
     "pose only": ("priors_of", _with_priors(pose_only=True)),
     "rough meshes, 3 mm": ("robot_body", _rough_body),
-    "background learned once": ("_LEARN_AT", (0,)),
 }
 """Name and value of the attribute of `solve` that is changed."""
 

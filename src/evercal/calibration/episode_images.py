@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from evercal.calibration.arm_in_view.covariance import in_base, parts
-from evercal.calibration.arm_in_view.fit import ArmFit, Fitter, TooFewPoints
+from evercal.calibration.arm_in_view.equations import ArmFit, TooFewPoints
+from evercal.calibration.arm_in_view.fit import Fitter
 from evercal.calibration.arm_in_view.result import LEAST_CONFIRMED
 from evercal.calibration.arm_in_view.solve import fit_arm, priors_of
 from evercal.calibration.arm_in_view.starts import Overlap
@@ -67,7 +68,7 @@ class EpisodeImages:
         if best is None or best.confirmed < LEAST_CONFIRMED:
             return None
         start = best.base_from_camera.pose
-        return self._fit(start, range(len(views)), _LAST_PX, (0,))
+        return self._fit(start, range(len(views)), _LAST_PX, is_final=True)
 
     def anywhere(self) -> ArmPose:
         """Find the pose without a start; InputError if the images do not confirm the arm."""
@@ -78,7 +79,7 @@ class EpisodeImages:
         start: SE3,
         images: Sequence[int],
         reaches: Sequence[float],
-        learn_at: Sequence[int] = (),
+        is_final: bool = False,
     ) -> ArmPose:
         zoom = max(0.5, max(self._fitter.views.size) / 640)
         try:
@@ -88,7 +89,7 @@ class EpisodeImages:
                 images,
                 [zoom * reach for reach in reaches],
                 _SPACING_PX,
-                learn_at,
+                is_final,
             )
         except (TooFewPoints, np.linalg.LinAlgError, cv2.error):
             return ArmPose(UncertainPose.exact(start), 0.0)

@@ -6,7 +6,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from evercal.calibration.arm_in_view.fit import Estimate, Fitter, Priors
+from evercal.calibration.arm_in_view.equations import Estimate, Priors
+from evercal.calibration.arm_in_view.fit import Fitter
 from evercal.calibration.arm_in_view.outline import (
     image_offsets,
     link_edges,

@@ -16,17 +16,6 @@ def calibrated_again(
     without = reference.source.get("without", ())
     start = reference.parent_from_child
     try:
-        return calibrate_arm_in_view(
-            recording,
-            model,
-            None,
-            without,
-            start,
-        )
+        return calibrate_arm_in_view(recording, model, None, without, start)
     except InputError:
-        return calibrate_arm_in_view(
-            recording,
-            model,
-            None,
-            without,
-        )
+        return calibrate_arm_in_view(recording, model, None, without)

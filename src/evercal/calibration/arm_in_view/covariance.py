@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from evercal.calibration.arm_in_view.fit import (
+from evercal.calibration.arm_in_view.equations import (
     FOCAL,
     JOINTS,
     LEAST_REPEATS,
@@ -53,16 +53,7 @@ def parts(fit: ArmFit, free: BoolArray | None = None) -> dict[str, tuple[Array, 
     sigma = fit.priors.sigma()
     least = LEAST_REPEATS / fit.repeats * fit.information()[np.ix_(free, free)]
     scatter = inverse @ (fit.scatter(free) + least) @ inverse
-    found = {
-        SCATTER: (
-            _whole(
-                scatter,
-                columns,
-                len(sigma),
-            ),
-            "images",
-        )
-    }
+    found = {SCATTER: (_whole(scatter, columns, len(sigma)), "images")}
     by_lens = inverse @ fit.information()[np.ix_(columns, np.arange(len(sigma))[LENS])]
     for name, (own, cause) in _SHARED.items():
         precision = np.zeros(len(sigma))
@@ -70,14 +61,7 @@ def parts(fit: ArmFit, free: BoolArray | None = None) -> dict[str, tuple[Array, 
         added = inverse @ np.diag(precision[free]) @ inverse
         if cause == "lens":
             added = added + by_lens @ lens @ by_lens.T
-        found[name] = (
-            _whole(
-                added,
-                columns,
-                len(sigma),
-            ),
-            cause,
-        )
+        found[name] = (_whole(added, columns, len(sigma)), cause)
     return found
 
 

@@ -53,11 +53,7 @@ class Rasterizer:
         length. So a larger image is drawn of points that are sheared, and cropped.
         """
         points = []
-        for vertices, pose in zip(
-            self._vertices,
-            camera_from_link,
-            strict=True,
-        ):
+        for vertices, pose in zip(self._vertices, camera_from_link, strict=True):
             points.append(vertices @ pose[:3, :3].T + pose[:3, 3])
         x, y, z = np.concatenate(points).T
         half_width = _half(camera.cx, camera.width)
@@ -70,11 +66,7 @@ class Rasterizer:
         drawn = [x * camera.fx / camera.fy + z * shear_x, -y - z * shear_y, -z]
         size = 2 * half_height, 2 * half_width
         shade = np.zeros((*size, 3), np.float32)
-        depth = np.full(
-            size,
-            _FAR_M,
-            np.float32,
-        )
+        depth = np.full(size, _FAR_M, np.float32)
         field_of_view = 2 * np.arctan(half_height / camera.fy)
         cv2.triangleRasterize(
             np.stack(drawn, 1).astype(np.float32),

@@ -7,14 +7,8 @@ import cv2
 import numpy as np
 
 from evercal.calibration.arm_in_view.covariance import SCATTER, halves, in_base, parts
-from evercal.calibration.arm_in_view.fit import (
-    FOCAL,
-    JOINTS,
-    LENS,
-    POSE,
-    ArmFit,
-    Fitter,
-)
+from evercal.calibration.arm_in_view.equations import FOCAL, JOINTS, LENS, POSE, ArmFit
+from evercal.calibration.arm_in_view.fit import Fitter
 from evercal.calibration.calibration import Calibration, ErrorTerm
 from evercal.calibration.checks import Checks
 from evercal.calibration.framed_pose import ImageUse, JointOffset
@@ -48,22 +42,12 @@ def calibration_of(
     covariance = sum((part for part, _ in whole.values()), np.zeros(()))
     of_pose = in_base(fit, covariance)
     terms = [
-        ErrorTerm.of(
-            name,
-            in_base(fit, part),
-            cause,
-        )
+        ErrorTerm.of(name, in_base(fit, part), cause)
         for name, (part, cause) in whole.items()
     ]
     for name, added in _turns_of_base(fit, fitter).items():
         of_pose = of_pose + added
-        terms.append(
-            ErrorTerm.of(
-                f"offset of joint {name}",
-                added,
-                "arm",
-            )
-        )
+        terms.append(ErrorTerm.of(f"offset of joint {name}", added, "arm"))
     apart = halves(fit)
     # Halves differ by twice the error of the whole.
     scatter = whole[SCATTER][0][POSE, POSE]
@@ -71,13 +55,7 @@ def calibration_of(
     if d2 > _HALVES_D2:
         added = of_pose * (d2 / _HALVES_D2 - 1)
         of_pose = of_pose + added
-        terms.append(
-            ErrorTerm.of(
-                "distance of halves of the images",
-                added,
-                "images",
-            )
-        )
+        terms.append(ErrorTerm.of("distance of halves of the images", added, "images"))
     stated = frames[0].camera
     estimated = stated.changed(fit.estimate.parameters[LENS])
     warnings = warnings_of(fit, fitter)
@@ -90,16 +68,8 @@ def calibration_of(
         lenses={"stated": stated, "estimated": estimated},
         images=_uses(fit, frames),
         error_terms=tuple(terms),
-        checks=_checks(
-            fit,
-            apart,
-            warnings,
-        ),
-        joints=_joints(
-            fit,
-            fitter,
-            covariance,
-        ),
+        checks=_checks(fit, apart, warnings),
+        joints=_joints(fit, fitter, covariance),
         joint_covariance=covariance[JOINTS:, JOINTS:],
         source={
             "command": "arm-in-view",
@@ -107,14 +77,7 @@ def calibration_of(
             "links_not_shown": links_not_shown(fit, fitter),
         },
     )
-    return replace(
-        calibration,
-        verdict=verdict_of(
-            calibration,
-            warnings,
-            "",
-        ),
-    )
+    return replace(calibration, verdict=verdict_of(calibration, warnings, ""))
 
 
 def _turns_of_base(fit: ArmFit, fitter: Fitter) -> dict[str, Array]:
@@ -143,23 +106,10 @@ def _uses(fit: ArmFit, frames: Sequence[Frame]) -> tuple[ImageUse, ...]:
         rows = equations.image == i
         name = frame.name
         if not rows.any():
-            uses.append(
-                ImageUse(
-                    name,
-                    False,
-                    "its outlines are not those of the arm",
-                )
-            )
+            uses.append(ImageUse(name, False, "its outlines are not those of the arm"))
             continue
         px = float(np.median(np.abs(equations.px[rows])))
-        uses.append(
-            ImageUse(
-                name,
-                True,
-                "",
-                px * _mm_per_px(fit),
-            )
-        )
+        uses.append(ImageUse(name, True, "", px * _mm_per_px(fit)))
     return tuple(uses)
 
 
@@ -185,13 +135,7 @@ def _joints(fit: ArmFit, fitter: Fitter, covariance: Array) -> tuple[JointOffset
     body = fitter.views.body
     rotates = {}
     for arm in body.arms:
-        rotates |= dict(
-            zip(
-                arm.joints,
-                arm.rotates().tolist(),
-                strict=True,
-            )
-        )
+        rotates |= dict(zip(arm.joints, arm.rotates().tolist(), strict=True))
     rows = []
     for k, name in enumerate(body.joints):
         why = ""
@@ -202,15 +146,7 @@ def _joints(fit: ArmFit, fitter: Fitter, covariance: Array) -> tuple[JointOffset
         elif sigma > 0.7 * prior:
             why = f"move {name} and the joints after it more between the images"
         offset = float(fit.estimate.offsets[k])
-        rows.append(
-            JointOffset(
-                name,
-                offset,
-                sigma,
-                rotates.get(name, True),
-                why,
-            )
-        )
+        rows.append(JointOffset(name, offset, sigma, rotates.get(name, True), why))
     return tuple(rows)
 
 
@@ -241,11 +177,7 @@ def links_not_shown(fit: ArmFit, fitter: Fitter) -> list[str]:
     """Names of links whose outlines the images do not show."""
     links = fitter.views.body.links
     testable = fit.equations.testable.sum(0)
-    shown = np.bincount(
-        fit.equations.link,
-        fit.weights,
-        minlength=len(links),
-    )
+    shown = np.bincount(fit.equations.link, fit.weights, minlength=len(links))
     is_lost = shown < _LINK_SHOWN * fit.confirmed * testable
     is_lost &= testable >= _LINK_POINTS
     return [links[k].link for k in np.flatnonzero(is_lost)]

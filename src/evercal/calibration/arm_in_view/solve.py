@@ -6,17 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from evercal.calibration.arm_in_view.covariance import WRONG_LENS, focal_sigmas
-from evercal.calibration.arm_in_view.fit import (
+from evercal.calibration.arm_in_view.equations import (
     ArmFit,
-    Fitter,
     Priors,
     TooFewPoints,
     solved,
 )
-from evercal.calibration.arm_in_view.result import (
-    LEAST_CONFIRMED,
-    calibration_of,
-)
+from evercal.calibration.arm_in_view.fit import Fitter
+from evercal.calibration.arm_in_view.result import LEAST_CONFIRMED, calibration_of
 from evercal.calibration.arm_in_view.starts import Overlap, starts
 from evercal.calibration.arm_in_view.views import ArmViews
 from evercal.calibration.calibration import Calibration
@@ -50,8 +47,6 @@ SHORT_IMAGES = 10
 _SHORT_PX = (40, 30, 20, 12, 8)
 """How far outlines are searched in the steps of a short fit, in pixels of an image of 640."""
 _FINAL_PX = (15, 10, 7, 5, 4, 4, 4)
-_LEARN_AT = (0, 2, 4)
-"""Steps of the final fit in which the background is learned again."""
 _SPACING_PX = 4.0
 
 
@@ -83,31 +78,12 @@ def calibrate_arm_in_view(
     frames = chosen_frames(recording)
     assert recording.arm is not None, "chosen_frames requires joint values"
     base = recording.frames.base or None
-    body = robot_body(
-        model,
-        recording.arm.joints,
-        base,
-        without,
-    )
+    body = robot_body(model, recording.arm.joints, base, without)
     fitter = Fitter(ArmViews.of(frames, body))
     priors = priors_of(body, errors or ArmErrors())
-    fit = fit_arm(
-        fitter,
-        priors,
-        start,
-        on_progress,
-    )
-    names = FrameNames(
-        body.base,
-        "",
-        recording.frames.camera,
-    )
-    return calibration_of(
-        fit,
-        fitter,
-        frames,
-        names,
-    )
+    fit = fit_arm(fitter, priors, start, on_progress)
+    names = FrameNames(body.base, "", recording.frames.camera)
+    return calibration_of(fit, fitter, frames, names)
 
 
 def chosen_frames(recording: Recording) -> list[Frame]:
@@ -160,41 +136,21 @@ def fit_arm(
     views = fitter.views
     zoom = max(views.size) / 640
     if start is None:
-        best = _best_start(
-            fitter,
-            priors,
-            zoom,
-            on_progress,
-        ).estimate
+        best = _best_start(fitter, priors, zoom, on_progress).estimate
     else:
         best = fitter.start(start.inverse())
     every = range(len(views))
     reaches = [zoom * reach for reach in _FINAL_PX]
     try:
-        fit = fitter.fit(
-            best,
-            priors,
-            every,
-            reaches,
-            _SPACING_PX,
-            _LEARN_AT,
-        )
+        fit = fitter.fit(best, priors, every, reaches, _SPACING_PX, is_final=True)
         if focal_sigmas(fit) > DOUBTFUL_LENS:
-            unknown = replace(
-                priors,
-                lens_is_free=True,
-                focal=WRONG_LENS,
-            )
+            unknown = replace(priors, lens_is_free=True, focal=WRONG_LENS)
             other = fitter.fit(
-                fit.estimate, unknown, every, reaches[-4:], _SPACING_PX, _LEARN_AT[:1]
+                fit.estimate, unknown, every, reaches[-4:], _SPACING_PX, True
             )
             if focal_sigmas(other) > CONTRADICTED_LENS:
                 known = replace(other.priors, lens_is_free=False)
-                fit = solved(
-                    other.estimate,
-                    other.equations,
-                    known,
-                )
+                fit = solved(other.estimate, other.equations, known)
     except (TooFewPoints, np.linalg.LinAlgError):
         raise InputError(NOT_RECOGNISED) from None
     if fit.confirmed < LEAST_CONFIRMED:
@@ -217,11 +173,7 @@ def _best_start(
     reaches = [zoom * reach for reach in _SHORT_PX]
     best = None
     for number, pose in enumerate(poses):
-        on_progress(
-            "trying starts",
-            number,
-            len(poses),
-        )
+        on_progress("trying starts", number, len(poses))
         if best and best.confirmed > SURE_CONFIRMED:
             break
         try:

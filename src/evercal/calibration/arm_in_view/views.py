@@ -70,26 +70,10 @@ class ArmViews:
             image = frame.read_image()
             if camera != plane:
                 pixels = x.reshape(size), y.reshape(size)
-                image = cv2.remap(
-                    image,
-                    *pixels,
-                    cv2.INTER_LINEAR,
-                )
-            images.append(
-                cv2.GaussianBlur(
-                    image,
-                    (3, 3),
-                    _SMOOTHING_PX,
-                )
-            )
+                image = cv2.remap(image, *pixels, cv2.INTER_LINEAR)
+            images.append(cv2.GaussianBlur(image, (3, 3), _SMOOTHING_PX))
         values = np.array([frame.joints_rad for frame in frames])
-        return cls(
-            np.stack(images),
-            valid.reshape(size),
-            plane,
-            body,
-            values,
-        )
+        return cls(np.stack(images), valid.reshape(size), plane, body, values)
 
     def __len__(self) -> int:
         return len(self.images)
@@ -136,11 +120,7 @@ class ArmViews:
         colours.sort(0)
         middle = (count[some] - 1) // 2
         background = self._background.copy()
-        background[some] = np.take_along_axis(
-            colours,
-            middle[None, :, None],
-            0,
-        )[0]
+        background[some] = np.take_along_axis(colours, middle[None, :, None], 0)[0]
         self._set_background(background, count >= LEAST_UNCOVERED)
 
     def masks(self, scale: float) -> Float32Array:
@@ -150,27 +130,10 @@ class ArmViews:
         small = []
         for difference in self.difference:
             moves = (difference > MOVES * self.noise).astype(np.uint8)
-            moves = cv2.morphologyEx(
-                moves,
-                cv2.MORPH_OPEN,
-                np.ones((3, 3), np.uint8),
-            )
-            moves = cv2.morphologyEx(
-                moves,
-                cv2.MORPH_CLOSE,
-                np.ones((5, 5), np.uint8),
-            )
+            moves = cv2.morphologyEx(moves, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+            moves = cv2.morphologyEx(moves, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
             share = moves.astype(np.float32)
-            small.append(
-                cv2.resize(
-                    share,
-                    (width, height),
-                    None,
-                    0,
-                    0,
-                    cv2.INTER_AREA,
-                )
-            )
+            small.append(cv2.resize(share, (width, height), None, 0, 0, cv2.INTER_AREA))
         return np.stack(small)
 
 

@@ -15,7 +15,7 @@ POINTS = 400
 LEAST_POINTS = 30
 """Minimum number of points in an image."""
 AGAIN_PX = 0.3
-"""Largest distance of a point that is tracked there and back, and scatter of their shifts."""
+"""Largest distance of a point that is tracked there and back."""
 
 
 def background_motion(moving: Sequence[Frame]) -> Array:
@@ -45,12 +45,15 @@ def motion_of_still(greys: Sequence[Image], still: BoolArray) -> Array:
         tracked, _, _ = cv2.calcOpticalFlowPyrLK(grey, other, points, points.copy())
         back, _, _ = cv2.calcOpticalFlowPyrLK(other, grey, tracked, points.copy())
         again = np.abs(back - points).max((1, 2)) < AGAIN_PX
-        shift = (tracked - points)[again].reshape(-1, 2)
-        if len(shift) < max(LEAST_POINTS, len(points) / 3):
+        if again.sum() < max(LEAST_POINTS, len(points) / 3):
             continue
-        middle = np.median(shift, 0)
-        if np.median(np.abs(shift - middle)) < AGAIN_PX:
-            motion[i] = middle
+        # With a turn about the optical axis; what moves by itself is an outlier.
+        _, inliers = cv2.estimateAffinePartial2D(
+            points[again], tracked[again], ransacReprojThreshold=2 * AGAIN_PX
+        )
+        still_ones = inliers.ravel() > 0
+        if still_ones.mean() > 0.5:
+            motion[i] = (tracked - points)[again][still_ones].mean((0, 1))
     return motion
 
 
