@@ -92,10 +92,10 @@ def in_base(fit: ArmFit, covariance: Array) -> Array:
 
 
 def halves(fit: ArmFit) -> Array:
-    """(6,) distance of the poses by every second image and by the others, in camera axes."""
+    """(6,) distance of the poses by the first half of the images and by the second, camera axes."""
     numbers = np.unique(fit.equations.image)
-    is_odd = np.isin(fit.equations.image, numbers[1::2])
-    return (fit.step(fit.free, is_odd) - fit.step(fit.free, ~is_odd))[POSE]
+    is_late = fit.equations.image >= numbers[len(numbers) // 2]
+    return (fit.step(fit.free, is_late) - fit.step(fit.free, ~is_late))[POSE]
 
 
 def _whole(covariance: Array, columns: IntArray, count: int) -> Array:

@@ -195,73 +195,43 @@ def image_offsets(
     """Find where image `i` ends to differ from the background, along the normals of points."""
     if not len(points.link):  # the arm is beside the image
         none = np.zeros(0)
-        return Offsets(
-            none,
-            none > 0,
-            none > 0,
-        )
+        return Offsets(none, none > 0, none > 0)
     is_fine = reach_px <= _FINE_PX
     step = 0.5 if is_fine else 1.0
     end = reach_px + _AROUND
-    along = np.arange(
-        -end,
-        end + step / 2,
-        step,
-    )
-    grid = points.pixels[:, None] + along[:, None] * points.normals[:, None]
+    along = np.arange(-end, end + step / 2, step)
+    normals = points.normals[:, None]
+    grid = points.pixels[:, None] + along[:, None] * normals
     differs = _sampled_at(views.difference[i], grid)
     known = _sampled_at(views.known.astype(np.float32), grid) > 0.99
-    like = (
-        np.clip(
-            differs / (_CONTRAST * views.noise) - 1,
-            -1,
-            1,
-        )
-        * known
-    )
+    contrast = differs / (_CONTRAST * views.noise)
+    like = np.clip(contrast - 1, -1, 1) * known
     if is_fine:
-        profile = _profile(_sampled_at(views.signed(i), grid), along)
+        signed = _sampled_at(views.signed(i), grid)
+        profile = _profile(signed, along)
         side = round(_SIDE / step)
-        best = _best(
-            _steps(profile, side),
-            along,
-            reach_px,
-        )
-        crossing = _crossing(
-            profile,
-            best,
-            side,
-        )
+        best = _best(_steps(profile, side), along, reach_px)
+        crossing = _crossing(profile, best, side)
     else:
         # The best end of the arm: like it before, unlike it after.
         total = np.cumsum(like, 1)
-        best = _best(
-            2 * total - total[:, -1:],
-            along,
-            reach_px,
-        )
+        score = 2 * total - total[:, -1:]
+        best = _best(score, along, reach_px)
         crossing = best + 0.5
     px = along[0] + step * crossing
     near = round(_AROUND / step)
     blurred = round(_BLURRED / step)
-    around = _beside(
-        like,
-        best,
-        near,
-    )
-    confirmed = np.isfinite(px) & (np.abs(px) <= reach_px)
-    confirmed &= around[:, : near - blurred].mean(1) > _INSIDE
-    confirmed &= around[:, near + blurred + 1 :].mean(1) < _OUTSIDE
-    testable = np.all(known[:, np.abs(along) <= _AROUND], 1)
-    return Offsets(
-        np.where(
-            confirmed,
-            px,
-            0.0,
-        ),
-        confirmed,
-        testable,
-    )
+    around = _beside(like, best, near)
+    inside = around[:, : near - blurred].mean(1)
+    outside = around[:, near + blurred + 1 :].mean(1)
+    confirmed = np.isfinite(px)
+    confirmed &= np.abs(px) <= reach_px
+    confirmed &= inside > _INSIDE
+    confirmed &= outside < _OUTSIDE
+    close = np.abs(along) <= _AROUND
+    testable = np.all(known[:, close], 1)
+    shown = np.where(confirmed, px, 0.0)
+    return Offsets(shown, confirmed, testable)
 
 
 def _beside(values: Array, at: IntArray, near: int) -> Array:

@@ -15,6 +15,7 @@ from evercal.calibration.framed_pose import ImageUse, JointOffset
 from evercal.calibration.from_map.hand_eye import verdict_of
 from evercal.calibration.held_thing.background import motion_of_still
 from evercal.calibration.held_thing.slip import MOVED_DEG, drift_deg_of
+from evercal.errors import InputError
 from evercal.geometry import length_mm_deg
 from evercal.recordings.frame import Frame
 from evercal.robot.frame_names import FrameNames
@@ -24,6 +25,8 @@ LEAST_CONFIRMED = 0.2
 """Least share of the outline that the images show at the right pose."""
 DOUBTFUL_CONFIRMED = 0.3
 """Below it, there is a warning."""
+REFUSED_DEG = 0.25
+"""Motion of the background from which a recording is refused: 7 mm at 1.6 m."""
 MOST_FOCAL = 0.015
 """Change of the focal length above which the intrinsics are doubtful."""
 _HALVES_D2 = 12.6
@@ -165,6 +168,11 @@ def warnings_of(fit: ArmFit, fitter: Fitter) -> list[str]:
             " calibrate the intrinsics first ('evercal detect' on images of a board)"
         )
     drift_deg = _drift_deg(fitter)
+    if drift_deg > REFUSED_DEG:
+        raise InputError(
+            f"the background moves by {drift_deg:.2f} deg in the recording: fasten the camera and"
+            " record again, or use the images before or after"
+        )
     if drift_deg > MOVED_DEG:
         warnings.append(
             f"the background moves by {drift_deg:.2f} deg in the recording: fasten the camera and"
