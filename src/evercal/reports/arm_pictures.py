@@ -50,7 +50,7 @@ def arm_pictures(
     start.offsets[:] = [joint.offset for joint in calibration.joints]
     priors = Priors(usual=np.zeros(len(joints)), pose_only=True)
     every = range(len(frames))
-    equations = fitter.fit(start, priors, every, _REACHES_PX, 2.0, (0, 1)).equations
+    equations = fitter.fit(start, priors, every, _REACHES_PX, 2.0, True).equations
     pictures = {}
     for i in np.linspace(0, len(frames) - 1, MAX_IMAGES).astype(int).tolist():
         share = np.mean(equations.image == i) * len(equations.px)
