@@ -12,7 +12,7 @@ from evercal.bounds import require_at_most
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError, optional_module
 from evercal.robot.arm import Arm
-from evercal.robot.meshes import Triangles, joined, merged, mesh_file, read_mesh
+from evercal.robot.meshes import merged, mesh_file, read_mesh
 from evercal.robot.robot_model import RobotModel
 from evercal.robot.urdf import Geometry, stated_geometry
 from evercal.storage.text_files import few, named_errors, naming
@@ -40,8 +40,8 @@ class LinkShape:
 
     def simplified(self, cell_m: float) -> Self:
         """The surface with one vertex for those in each cell of a grid."""
-        mesh = merged(Triangles(self.vertices, self.faces), cell_m)
-        return replace(self, vertices=mesh.vertices, faces=mesh.faces)
+        vertices, faces = merged(self.vertices[self.faces], cell_m)
+        return replace(self, vertices=vertices, faces=faces)
 
 
 @frozen_arrays
@@ -134,7 +134,7 @@ def _rest(arm: Arm) -> Array:
 
 
 def _links(urdf: Path, geometry: Sequence[Geometry]) -> list[LinkShape]:
-    surfaces: dict[str, list[Triangles]] = {}
+    surfaces: dict[str, list[Array]] = {}
     read = count = 0
     for part in geometry:
         with naming(f"link {part.link}"):
@@ -142,35 +142,34 @@ def _links(urdf: Path, geometry: Sequence[Geometry]) -> list[LinkShape]:
                 file = mesh_file(urdf, part.file)
                 read += file.stat().st_size
                 require_at_most(read, "mesh_bytes", "bytes of meshes")
-                vertices, faces = read_mesh(file)
-                vertices = vertices * part.sizes
+                corners = read_mesh(file) * part.sizes
                 if np.prod(part.sizes) < 0:
-                    faces = faces[:, ::-1]
+                    corners = corners[:, ::-1]
             else:
-                vertices, faces = _primitive(part)
-            count += len(faces)
+                corners = _primitive(part)
+            count += len(corners)
             require_at_most(count, "faces", "triangles of meshes")
-        turned = vertices @ Rotation.from_euler("xyz", part.rpy).as_matrix().T
-        surface = Triangles(turned + part.xyz, faces)
-        surfaces.setdefault(part.link, []).append(surface)
-    links = [_link(name, joined(parts)) for name, parts in surfaces.items()]
+        turned = corners @ Rotation.from_euler("xyz", part.rpy).as_matrix().T
+        surfaces.setdefault(part.link, []).append(turned + part.xyz)
+    links = [_link(name, np.concatenate(parts)) for name, parts in surfaces.items()]
     return [link for link in links if len(link.faces)]
 
 
-def _link(name: str, surface: Triangles) -> LinkShape:
-    size = np.ptp(surface.vertices, axis=0).max()
+def _link(name: str, corners: Array) -> LinkShape:
+    size = np.ptp(corners, axis=(0, 1)).max()
     if size > _LARGEST_M:
         raise ValueError(
             f"link {name}: is {size:.4g} m large; lengths are metres; give a mesh in millimetres"
             ' scale="0.001 0.001 0.001"'
         )
     cell = _SAME_M
-    if len(surface.faces) > _MANY:
+    if len(corners) > _MANY:
         cell = _CELL_M
-    return LinkShape(name, *merged(surface, cell))
+    return LinkShape(name, *merged(corners, cell))
 
 
-def _primitive(part: Geometry) -> Triangles:
+def _primitive(part: Geometry) -> Array:
+    """(m, 3, 3) corners of its triangles."""
     creation = optional_module("trimesh.creation", "geometry needs trimesh", "urdf")
     if part.shape == "box":
         mesh = creation.box(part.sizes)
@@ -180,4 +179,4 @@ def _primitive(part: Geometry) -> Triangles:
         mesh = creation.icosphere(4, *part.sizes)
     else:
         raise ValueError(f"its {part.kind} is no mesh, box, cylinder or sphere")
-    return Triangles(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    return np.array(mesh.vertices[mesh.faces])

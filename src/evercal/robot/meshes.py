@@ -2,10 +2,8 @@
 
 import os
 import re
-from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
 from urllib.parse import unquote
 from warnings import catch_warnings, simplefilter
 
@@ -23,15 +21,6 @@ _PACKAGES = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
 _MOST_NODES = 30
 """Most repeated nodes of a DAE; public robots have one."""
 _DECLARATION = re.compile(r"^\s*<\?xml[^>]*>\s*")
-
-
-class Triangles(NamedTuple):
-    """A surface."""
-
-    vertices: Array
-    """(n, 3) metres."""
-    faces: IntArray
-    """(m, 3) vertices of each triangle, counterclockwise as seen from outside."""
 
 
 def mesh_file(urdf: Path, name: str) -> Path:
@@ -64,39 +53,38 @@ def mesh_file(urdf: Path, name: str) -> Path:
     )
 
 
-def read_mesh(path: Path) -> Triangles:
-    """All triangles of a mesh file, in its unit or, if a DAE states that, in metres.
+def read_mesh(path: Path) -> Array:
+    """(m, 3, 3) corners of the triangles of a file, in its unit or, if a DAE states it, in metres.
 
-    As in RViz, the upward axis of a DAE does not count.
+    They are counterclockwise as seen from outside. As in RViz, the upward axis of a DAE does not
+    count.
     """
     kind = path.suffix[1:].lower()
     data = path.read_bytes()
     with library_errors(f"{path}: cannot be read as a mesh"), catch_warnings():
         if kind == "dae":
             simplefilter("ignore", PendingDeprecationWarning)  # it uses np.matrix
-            mesh = _collada(decoded(data))
+            corners = _collada(decoded(data))
         else:
             trimesh = optional_module("trimesh", _NEED, "urdf")
-            read = trimesh.load_mesh(
+            mesh = trimesh.load_mesh(
                 BytesIO(data), kind, process=False, skip_materials=True
             )
-            mesh = Triangles(
-                np.array(read.vertices, float), np.array(read.faces, np.int64)
-            )
-        if not len(mesh.faces):
+            corners = np.array(mesh.vertices[mesh.faces], float)
+        if not len(corners):
             raise ValueError("it has no triangles; leave the link out by `without`")
-    return mesh
+    return corners
 
 
-def _collada(text: str) -> Triangles:
-    """Triangles of COLLADA. Nodes may repeat nodes without limit, so their number is bounded."""
+def _collada(text: str) -> Array:
+    """Corners of COLLADA. Nodes may repeat nodes without limit, so their number is bounded."""
     if "<!DOCTYPE" in text or text.count("instance_node") > _MOST_NODES:
         raise ValueError("it has a DOCTYPE or many instance_node; export it without")
     collada = optional_module("collada", _NEED, "urdf")
     # A fault of a material, such as a missing texture, would cost what has it.
     text = _DECLARATION.sub("", text).replace("bind_material", "extra")
     document = collada.Collada(BytesIO(text.encode()), ignore=[collada.common.DaeError])
-    corners = [np.empty((0, 3))]
+    corners = [np.empty((0, 3, 3))]
     count = 0
     for geometry in document.scene.objects("geometry"):
         require_at_most(count, "faces", "triangles of meshes")
@@ -104,35 +92,23 @@ def _collada(text: str) -> Triangles:
             if hasattr(part, "triangleset"):
                 part = part.triangleset()
             if isinstance(part, collada.triangleset.BoundTriangleSet):
-                corners.append(part.vertex[part.vertex_index.ravel()])
+                corners.append(part.vertex[part.vertex_index])
                 count += len(part)
-    vertices = np.concatenate(corners) * (document.assetInfo.unitmeter or 1.0)
-    return Triangles(vertices, np.arange(len(vertices)).reshape(-1, 3))
+    return np.concatenate(corners) * (document.assetInfo.unitmeter or 1.0)
 
 
-def joined(parts: Sequence[Triangles]) -> Triangles:
-    """All triangles of several surfaces."""
-    vertices = []
-    faces = []
-    count = 0
-    for part in parts:
-        vertices.append(part.vertices)
-        faces.append(part.faces + count)
-        count += len(part.vertices)
-    return Triangles(np.concatenate(vertices), np.concatenate(faces))
-
-
-def merged(mesh: Triangles, cell_m: float) -> Triangles:
-    """The mesh with one vertex, the mean, for those in one cell of a grid.
+def merged(corners: Array, cell_m: float) -> tuple[Array, IntArray]:
+    """Vertices and faces of triangles (m, 3, 3): the mean of the corners in each cell of a grid.
 
     Triangles that shrink to a line, and repeated ones, are left out.
     """
-    cells = np.round(mesh.vertices / cell_m).astype(np.int64)
+    points = corners.reshape(-1, 3)
+    cells = np.round(points / cell_m).astype(np.int64)
     _, index, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    sums = [np.bincount(index, column) for column in mesh.vertices.T]
+    sums = [np.bincount(index, column) for column in points.T]
     vertices = np.stack(sums, 1) / count[:, None]
-    faces = index[mesh.faces]
-    corners = np.sort(faces, 1)
-    _, first = np.unique(corners, axis=0, return_index=True)
-    whole = (np.diff(corners[first], axis=1) > 0).all(1)
-    return Triangles(vertices, faces[np.sort(first[whole])])
+    faces = index.reshape(-1, 3)
+    ordered = np.sort(faces, 1)
+    _, first = np.unique(ordered, axis=0, return_index=True)
+    whole = (np.diff(ordered[first], axis=1) > 0).all(1)
+    return vertices, faces[np.sort(first[whole])]
