@@ -47,6 +47,7 @@ SHORT_IMAGES = 10
 _SHORT_PX = (40, 30, 20, 12, 8)
 """How far outlines are searched in the steps of a short fit, in pixels of an image of 640."""
 _FINAL_PX = (15, 10, 7, 5, 4, 4, 4)
+"""The same of the final fit, at the end in pixels of any image."""
 _SPACING_PX = 4.0
 
 
@@ -140,7 +141,8 @@ def fit_arm(
     else:
         best = fitter.start(start.inverse())
     every = range(len(views))
-    reaches = [zoom * reach for reach in _FINAL_PX]
+    last = _FINAL_PX[-1]
+    reaches = [last + zoom * (reach - last) for reach in _FINAL_PX]
     try:
         fit = fitter.fit(best, priors, every, reaches, _SPACING_PX, is_final=True)
         if focal_sigmas(fit) > DOUBTFUL_LENS:
