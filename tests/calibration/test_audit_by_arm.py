@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,12 +18,11 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
     poses_from_numbers,
 )
-from evercal.robot.robot_model import RobotModel
-
-from ..recordings.formats.test_lerobot import URDF
 
 TRUTH = SE3.exp([0.9, -0.5, 0.7, 1.1, -0.6, 2.0])
 OTHER = SE3.exp([-0.4, 1.2, 0.6, -0.9, 0.3, 1.4])
+HAND = SE3.exp([0.3, 0.2, 0.6, 0.4, -0.5, 0.9])
+"""base_from_tip in the image."""
 HIDDEN = "the images show 12 % of the outline"
 
 
@@ -55,6 +53,9 @@ class Shown:
         near = [s for s in starts if max(pose_distance_mm_deg(s, TRUTH)) < 60]
         return self.pose() if near else None
 
+    def links(self) -> dict[str, SE3]:
+        return {"tip": HAND}
+
     def anywhere(self) -> ArmPose:
         if not self.anywhere_too:
             raise InputError(HIDDEN)
@@ -62,14 +63,11 @@ class Shown:
 
 
 def audited(
-    tmp_path: Path,
     numbers: Any,
     shown: Shown,
     known: Sequence[SE3] = (),
     **more: Any,
 ) -> Audited:
-    (tmp_path / "arm.urdf").write_text(URDF)
-    model = RobotModel(tmp_path / "arm.urdf")
     camera = Camera(64, 48, 60, 60, 31.5, 23.5)
     image = np.zeros((48, 64, 3), np.uint8)
     frame = Frame("0", image, camera, None, joints_rad=(0.4, 0.1))
@@ -77,7 +75,7 @@ def audited(
     stated = {"side": tuple(numbers), **others} if len(numbers) else {}
     episode = Episode("e", "side", (frame,), ("shoulder", "reach"), stated)
     look: Any = lambda _: shown  # noqa: E731
-    audit = ArmAudit(model, look, **more)
+    audit = ArmAudit(look, **more)
     return audit.done(0, (episode, known))
 
 
@@ -89,18 +87,11 @@ def corrected(result: Audited, convention: str = "rpy") -> SE3:
     return poses_from_numbers(result.corrected, pose_convention(convention))
 
 
-def test_a_right_pose_is_right(tmp_path: Path) -> None:
-    result = audited(tmp_path, numbers_of(TRUTH), Shown())
+def test_a_right_pose_is_right() -> None:
+    result = audited(numbers_of(TRUTH), Shown())
     assert (result.verdict, result.mistake) == ("right", "")
     assert result.translation_mm == pytest.approx(5, abs=0.1)
     assert (result.sigma_mm, result.confirmed) == (pytest.approx(5), 0.5)
-
-
-def hand(tmp_path: Path) -> SE3:
-    """base_from_tip in the image."""
-    (tmp_path / "arm.urdf").write_text(URDF)
-    model = RobotModel(tmp_path / "arm.urdf")
-    return model.arm("base", "tip").poses(np.array([[0.4, 0.1]]))[0]
 
 
 @pytest.mark.parametrize(
@@ -113,80 +104,77 @@ def hand(tmp_path: Path) -> SE3:
         ("gripper", "relative to tip"),
     ],
 )
-def test_usual_mistakes_are_named_and_repaired(
-    mistake: str, words: str, tmp_path: Path
-) -> None:
+def test_usual_mistakes_are_named_and_repaired(mistake: str, words: str) -> None:
     numbers = {
         "inverse": numbers_of(TRUTH.inverse()),
         "mm": numbers_of(TRUTH, "rpy:mm"),
         "deg": numbers_of(TRUTH, "rpy:deg"),
         "order": numbers_of(TRUTH, "moving_zyx"),
-        "gripper": numbers_of(hand(tmp_path).inverse() @ TRUTH),
+        "gripper": numbers_of(HAND.inverse() @ TRUTH),
     }[mistake]
     shown = Shown(anywhere_too=False)  # found by trying the mistake
-    result = audited(tmp_path, numbers, shown)
+    result = audited(numbers, shown)
     assert (result.verdict, result.mistake) == ("wrong", words)
     # The numbers are read as they were meant, which is better than what the images show.
     np.testing.assert_allclose(corrected(result).matrix(), TRUTH.matrix(), atol=1e-9)
 
 
-def test_the_pose_of_another_camera_is_named(tmp_path: Path) -> None:
+def test_the_pose_of_another_camera_is_named() -> None:
     global TRUTH
     shown = Shown(anywhere_too=False)
     truth = TRUTH
     try:
         TRUTH = OTHER
-        result = audited(tmp_path, numbers_of(truth), shown)
+        result = audited(numbers_of(truth), shown)
     finally:
         TRUTH = truth
     assert (result.verdict, result.mistake) == ("wrong", "that of front")
 
 
-def test_a_pose_elsewhere_is_corrected_by_the_images(tmp_path: Path) -> None:
+def test_a_pose_elsewhere_is_corrected_by_the_images() -> None:
     moved = SE3.exp([0.08, 0.03, 0, 0.05, 0, 0]) @ TRUTH
-    result = audited(tmp_path, numbers_of(moved, "matrix"), Shown())
+    result = audited(numbers_of(moved, "matrix"), Shown())
     assert (result.verdict, result.mistake) == ("wrong", "")
     distance = pose_distance_mm_deg(corrected(result, "matrix"), TRUTH)
     assert distance[0] == pytest.approx(5, abs=0.1)
 
 
-def test_poses_of_other_episodes_are_tried(tmp_path: Path) -> None:
+def test_poses_of_other_episodes_are_tried() -> None:
     shown = Shown(anywhere_too=False)
-    result = audited(tmp_path, numbers_of(OTHER @ OTHER), shown, [TRUTH])
+    result = audited(numbers_of(OTHER @ OTHER), shown, [TRUTH])
     assert result.verdict == "wrong"
-    result = audited(tmp_path, numbers_of(OTHER @ OTHER), shown)
+    result = audited(numbers_of(OTHER @ OTHER), shown)
     assert (result.verdict, result.reason) == ("unknown", HIDDEN)
     assert result.corrected == ()
 
 
-def test_nothing_is_accused_on_weak_evidence(tmp_path: Path) -> None:
+def test_nothing_is_accused_on_weak_evidence() -> None:
     far = SE3.exp([0.2, 0.1, 0, 0.3, 0, 0]) @ TRUTH
-    assert audited(tmp_path, numbers_of(far), Shown()).verdict == "wrong"
+    assert audited(numbers_of(far), Shown()).verdict == "wrong"
     # The images show nearly as much of the arm at the stated pose.
-    weak = audited(tmp_path, numbers_of(far), Shown(at_stated=0.42))
+    weak = audited(numbers_of(far), Shown(at_stated=0.42))
     assert weak.verdict == "unknown"
     assert "hardly less of the arm at the stated one" in weak.reason
     # They do not decide the pose.
     shift = SE3.exp([0.04, 0, 0, 0, 0, 0]) @ TRUTH
-    assert audited(tmp_path, numbers_of(shift), Shown()).verdict == "wrong"
-    assert audited(tmp_path, numbers_of(shift), Shown(sigma_mm=15)).verdict == "unknown"
+    assert audited(numbers_of(shift), Shown()).verdict == "wrong"
+    assert audited(numbers_of(shift), Shown(sigma_mm=15)).verdict == "unknown"
     # They show too little of the arm beside a pose that is right.
     hidden = Shown(confirmed=0.12, anywhere_too=False)
     hidden.near = lambda _: None  # pyright: ignore[reportAttributeAccessIssue]
-    assert audited(tmp_path, numbers_of(TRUTH), hidden).verdict == "unknown"
+    assert audited(numbers_of(TRUTH), hidden).verdict == "unknown"
 
 
-def test_a_pose_of_all_or_of_none(tmp_path: Path) -> None:
-    result = audited(tmp_path, (), Shown())
+def test_a_pose_of_all_or_of_none() -> None:
+    result = audited((), Shown())
     assert (result.verdict, result.reason) == ("unknown", "states no pose")
     assert len(result.corrected) == 16
-    assert audited(tmp_path, (), Shown(), of_all=TRUTH).verdict == "right"
-    assert audited(tmp_path, (), Shown(), of_all=OTHER).verdict == "wrong"
+    assert audited((), Shown(), of_all=TRUTH).verdict == "right"
+    assert audited((), Shown(), of_all=OTHER).verdict == "wrong"
 
 
-def test_an_episode_that_cannot_be_read_is_unknown(tmp_path: Path) -> None:
-    (tmp_path / "arm.urdf").write_text(URDF)
-    audit = ArmAudit(RobotModel(tmp_path / "arm.urdf"), lambda _: pytest.fail("read"))
+def test_an_episode_that_cannot_be_read_is_unknown() -> None:
+    audit = ArmAudit(lambda _: pytest.fail("read"))
     episode = Episode("e", problem="video is missing")
     result = audit.done(0, (episode, ()))
     expected = Audited("e", "", (), "unknown", "video is missing")

@@ -110,17 +110,26 @@ def test_wrong_poses_are_found_named_and_repaired(run, data_set, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("set --urdf robot.urdf", "give the folder of one data set, and intrinsics"),
-        ("set set --urdf robot.urdf --camera camera.json", "folder of one data set"),
-        ("set", "give MAP and DIR; or a data set alone, with --urdf and --camera"),
-        (". --urdf robot.urdf --camera camera.json", "no data set; give the folder"),
-        ("set --urdf no.urdf --camera camera.json", "no.urdf: no such URDF file"),
+        ("set --urdf robot.urdf", "give the folder of one data set, intrinsics"),
         (
-            "set --urdf robot.urdf --camera camera.json --pose-convention euler",
+            "set set --urdf robot.urdf --camera camera.json --out o",
+            "folder of one data set",
+        ),
+        ("set", "give MAP and DIR; or a data set alone, with --urdf and --camera"),
+        (
+            ". --urdf robot.urdf --camera camera.json --out o",
+            "no data set; give the folder",
+        ),
+        (
+            "set --urdf no.urdf --camera camera.json --out o",
+            "no.urdf: no such URDF file",
+        ),
+        (
+            "set --urdf robot.urdf --camera camera.json --out o --pose-convention euler",
             "pose convention 'euler' is not known",
         ),
         (
-            "set --urdf robot.urdf --camera camera.json --without claw",
+            "set --urdf robot.urdf --camera camera.json --out o --without claw",
             "has no link claw",
         ),
     ],

@@ -1,7 +1,7 @@
 """Stated poses of fixed cameras in recorded episodes, compared with the arm in their images."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -9,17 +9,17 @@ import numpy as np
 
 from evercal.calibration.arm_in_view.result import LEAST_CONFIRMED
 from evercal.calibration.episode_images import ArmPose, EpisodeImages
-from evercal.calibration.stated_mistakes import Reading, readings
+from evercal.calibration.stated_mistakes import readings
 from evercal.classes import frozen, frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import SE3, pose_distance_mm_deg
-from evercal.recordings.episodes.episode import Episode, Numbers
+from evercal.recordings.episodes.episode import Episode
 from evercal.recordings.poses.conventions import (
     PoseConvention,
     numbers_from_poses,
     pose_convention,
 )
-from evercal.robot.robot_model import RobotModel
+from evercal.typing import Floats, Pair
 
 LARGEST_SQUARE = 22.5
 """Squared Mahalanobis distance that one of 1,000 right poses exceeds (chi-squared, 6 degrees of
@@ -39,15 +39,16 @@ class Audited:
 
     episode: str
     camera: str
-    stated: Numbers
+    stated: Floats
     """Pose in the data set."""
     verdict: Literal["right", "wrong", "unknown"]
     """Whether the stated pose fits the images; unknown if they do not decide it."""
     reason: str
     mistake: str = ""
     """What is wrong, if it is a usual mistake."""
-    corrected: Numbers = ()
-    """The estimated pose in the notation of the data set; empty if there is none."""
+    corrected: Floats = ()
+    """The pose in the notation of the data set: as stated where that is right, else the estimated
+    one; empty if there is none."""
     translation_mm: float | None = None
     """Distance of the stated pose from the estimated one."""
     rotation_deg: float | None = None
@@ -68,13 +69,12 @@ Source = tuple[Episode, Sequence[SE3]]
 class ArmAudit:
     """How episodes are audited; a task of `learning.many`."""
 
-    model: RobotModel
     look: Callable[[Episode], EpisodeImages]
-    convention: str | None = None
+    convention: PoseConvention | None = None
     """Of the stated poses; if omitted, the usual one for so many numbers."""
     of_all: SE3 | None = None
     """base_from_camera of cameras without a stated pose."""
-    agreement: tuple[float, float] = (20.0, 1.0)
+    agreement: Pair = (20.0, 1.0)
     """Largest difference that still agrees, millimetres and degrees."""
 
     def done(self, number: int, source: Source) -> Audited:
@@ -92,28 +92,26 @@ class ArmAudit:
         stated = episode.stated.get(episode.camera, ())
         return Audited(episode.name, episode.camera, stated, "unknown", error)
 
-    def convention_of(self, numbers: Numbers) -> PoseConvention:
+    def convention_of(self, numbers: Floats) -> PoseConvention:
         """The convention of stated numbers."""
         usual = _USUAL.get(len(numbers), "matrix")
-        return pose_convention(self.convention or usual)
+        return self.convention or pose_convention(usual)
 
     def _audited(self, episode: Episode, known: Sequence[SE3]) -> Audited:
         if episode.problem:
             raise InputError(episode.problem)
         result = self.failed(0, (episode, known), "states no pose")
-        possible = [*self._readings(episode, result.stated)]
         images = self.look(episode)
-        beside = None
-        if possible and not possible[0][0]:
-            beside = images.beside(possible[0][1])
-            if beside.confirmed >= LEAST_CONFIRMED:
-                result = self._compared(result, possible, beside)
-                if result.verdict == "right":
-                    return result
-        starts = [pose for words, pose in possible if len(words) <= 1]
-        found = images.near([*known, *starts]) or images.anywhere()
+        possible = self._readings(episode, images, result.stated)
+        stated = possible.get("")
+        beside = stated and images.beside(stated)
+        if beside and beside.confirmed >= LEAST_CONFIRMED:
+            result = self._compared(result, possible, beside)
+            if result.verdict == "right":
+                return result
+        found = images.near([*known, *possible.values()]) or images.anywhere()
         result = self._compared(result, possible, found)
-        if beside is None or result.verdict != "wrong":
+        if not beside or result.verdict != "wrong":
             return result
         same = self._agree(beside.base_from_camera.pose, found.base_from_camera.pose)
         if same or found.confirmed > MORE_CONFIRMED * beside.confirmed:
@@ -122,67 +120,56 @@ class ArmAudit:
         return replace(result, verdict="unknown", mistake="", reason=reason)
 
     def _compared(
-        self, result: Audited, possible: Sequence[Reading], found: ArmPose
+        self, result: Audited, possible: dict[str, SE3], found: ArmPose
     ) -> Audited:
         """The result with the pose that images show."""
         estimate = found.base_from_camera
-        convention = self.convention_of(result.stated)
-
-        def noted(pose: SE3) -> Numbers:
-            return tuple(numbers_from_poses(pose, convention).tolist())
-
         result = replace(
             result,
-            corrected=noted(estimate.pose),
+            corrected=self._noted(estimate.pose, result),
             sigma_mm=estimate.sigma_mm,
             sigma_deg=estimate.sigma_deg,
             confirmed=found.confirmed,
         )
-        if not possible:
-            return result
-        words, stated = possible[0]
-        result = replace(
-            result, verdict="wrong", reason=f"no pose as {convention.name}"
-        )
-        if not words:
+        stated = possible.get("")
+        if stated:
             mm, degrees = pose_distance_mm_deg(stated, estimate.pose)
             reason = f"stated pose is {mm:.0f} mm and {degrees:.1f} deg from the images"
             result = replace(
                 result, reason=reason, translation_mm=mm, rotation_deg=degrees
             )
             if self._agree(stated, estimate.pose):
-                return replace(result, verdict="right")
+                return replace(result, verdict="right", corrected=result.stated)
             if estimate.squared_mahalanobis(stated) < LARGEST_SQUARE:
-                return replace(result, verdict="unknown")
-        for words, pose in possible:
+                return result
+            result = replace(result, verdict="wrong")
+        for words, pose in possible.items():
             if words and self._agree(pose, estimate.pose, _NAMING):
-                mistake = ", ".join(words)
-                return replace(result, mistake=mistake, corrected=noted(pose))
+                corrected = self._noted(pose, result)
+                return replace(
+                    result, verdict="wrong", mistake=words, corrected=corrected
+                )
         return result
 
-    def _readings(self, episode: Episode, numbers: Numbers) -> Iterator[Reading]:
-        """What the stated numbers may mean; first as they are stated, if that is a pose."""
-        if self.of_all is not None and not numbers:
-            yield (), self.of_all
-        for words, pose in readings(numbers, self.convention_of(numbers)):
-            yield words, pose
-            if not words:
-                for link, base_from_link in self._links(episode):
-                    yield (f"relative to {link}",), base_from_link @ pose
-        for camera, other in episode.stated.items():
-            for words, pose in readings(other, self.convention_of(other)):
-                if not words and camera != episode.camera:
-                    yield (f"that of {camera}",), pose
+    def _noted(self, pose: SE3, result: Audited) -> Floats:
+        convention = self.convention_of(result.stated)
+        return tuple(numbers_from_poses(pose, convention).tolist())
 
-    def _links(self, episode: Episode) -> Iterator[tuple[str, SE3]]:
-        """base_from_link of the links that move, in the first image."""
-        values = episode.frames[0].joints_rad or ()
-        known = dict(zip(episode.joints, values, strict=True))
-        for link in self.model.links:
-            arm = self.model.arm(self.model.base_link, link)
-            if arm.joints and known.keys() >= {*arm.joints}:
-                row = [known[name] for name in arm.joints]
-                yield link, arm.poses(np.array([row]))[0]
+    def _readings(
+        self, episode: Episode, images: EpisodeImages, numbers: Floats
+    ) -> dict[str, SE3]:
+        """What the stated numbers may mean, by mistake; as they are stated without one."""
+        if self.of_all and not numbers:
+            return {"": self.of_all}
+        found = readings(numbers, self.convention_of(numbers))
+        if "" in found:
+            for link, base_from_link in images.links().items():
+                found[f"relative to {link}"] = base_from_link @ found[""]
+        for camera, other in episode.stated.items():
+            pose = readings(other, self.convention_of(other)).get("")
+            if pose and camera != episode.camera:
+                found[f"that of {camera}"] = pose
+        return found
 
     def _agree(self, a: SE3, b: SE3, times: float = 1.0) -> bool:
         difference = np.array(pose_distance_mm_deg(a, b))

@@ -1,8 +1,7 @@
 """Where the images of an episode show the camera: near poses that are tried, or anywhere."""
 
-import functools
 from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -18,10 +17,8 @@ from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import SE3, UncertainPose
 from evercal.recordings.episodes.episode import Episode
-from evercal.robot.link_shapes import RobotBody, robot_body
+from evercal.robot.link_shapes import RobotBody
 from evercal.robot.pose_errors import ArmErrors
-from evercal.robot.robot_model import RobotModel
-from evercal.typing import Strings
 
 TRIED = 3
 """Starts that are fitted, of those that overlap most with what moves."""
@@ -43,12 +40,22 @@ class ArmPose:
 class EpisodeImages:
     """Images of a camera in an episode."""
 
-    def __init__(self, urdf: Path, without: Strings, episode: Episode) -> None:
-        body = _body(urdf, without, episode.joints)
+    def __init__(self, body: RobotBody, episode: Episode) -> None:
+        body = replace(body, joints=episode.joints)
         self._fitter = Fitter(ArmViews.of(episode.frames, body))
         self._priors = priors_of(body, ArmErrors())
         if not self._fitter.moving.any():
             raise InputError("the arm does not move in the images")
+
+    def links(self) -> dict[str, SE3]:
+        """base_from_link of the links that move, in the first image."""
+        views = self._fitter.views
+        found = {}
+        for arm, shape in zip(views.body.arms, views.body.links, strict=True):
+            if arm.joints:
+                values = views.body.values_of(arm, views.values[:1])
+                found[shape.link] = arm.poses(values)[0]
+        return found
 
     def beside(self, start: SE3, reaches: Sequence[float] = _LAST_PX[:2]) -> ArmPose:
         """Fit every second image in few steps."""
@@ -94,11 +101,6 @@ class EpisodeImages:
         except (TooFewPoints, np.linalg.LinAlgError, cv2.error):
             return ArmPose(UncertainPose.exact(start), 0.0)
         return _pose(found)
-
-
-@functools.lru_cache(maxsize=2)
-def _body(urdf: Path, without: Strings, joints: Strings) -> RobotBody:
-    return robot_body(RobotModel(urdf), joints, without=without)
 
 
 def _pose(fit: ArmFit) -> ArmPose:

@@ -5,15 +5,18 @@ import hashlib
 from collections import Counter
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
 from evercal.classes import frozen
 from evercal.cli import args
-from evercal.cli.console import require_writable, say
+from evercal.cli.console import require_writable
 from evercal.errors import InputError
 from evercal.progress import progress_bar
+
+if TYPE_CHECKING:
+    from evercal.calibration.audit_by_arm import Audited
 
 Tolerance = Annotated[float | None, arg(metavar="N")]
 
@@ -56,8 +59,8 @@ class Audit(args.Verb):
     without: Annotated[tuple[str, ...], args.shown("LINK")] = ()
     """With --urdf: links that are not mounted."""
     out: args.File = None
-    """With --urdf: write the camera poses of all episodes, corrected where they are wrong. Results
-    so far are beside it, so that the same command goes on after a stop."""
+    """With --urdf: write the camera poses of all episodes here, corrected where they are wrong.
+    Results so far are beside it, so that the same command goes on after a stop."""
     workers: args.Count = None
     """With --urdf: processes. Default: one for each core."""
     ray: args.Address = None
@@ -99,20 +102,20 @@ class Audit(args.Verb):
         return 1 if wrong else 0
 
     def _by_arm(self, urdf: Path) -> int:
-        if len(self.folders) != 1 or self.camera is None:
+        if len(self.folders) != 1 or not self.camera or not self.out:
             raise InputError(
-                "--urdf: give the folder of one data set, and intrinsics with --camera"
+                "--urdf: give the folder of one data set, intrinsics with --camera, and --out"
             )
         require_writable(self.out, "--out")
         from evercal.calibration.audit_by_arm import ArmAudit
         from evercal.calibration.episode_images import EpisodeImages
-        from evercal.learning.audits import audit_episodes, corrections, with_moves
+        from evercal.learning.audits import audit_episodes, with_moves
         from evercal.processes import cores
         from evercal.recordings.episodes import episodes_in
+        from evercal.recordings.poses.conventions import pose_convention
         from evercal.recordings.read_options import ReadOptions
         from evercal.robot.link_shapes import robot_body
         from evercal.robot.robot_model import RobotModel
-        from evercal.storage import write_json
         from evercal.storage.text_files import named_errors
 
         model = RobotModel(urdf)
@@ -121,43 +124,48 @@ class Audit(args.Verb):
         total, episodes = episodes_in(
             self.folders[0], model, self.camera, options, count
         )
+        convention = None
+        if self.pose_convention:
+            with named_errors("--pose-convention", "convention"):
+                convention = pose_convention(self.pose_convention)
         audit = ArmAudit(
-            model,
-            partial(EpisodeImages, urdf, self.without),
-            self.pose_convention,
+            partial(EpisodeImages, robot_body(model, (), without=self.without)),
+            convention,
             args.transform_of(self.calibration),
             (self.most_mm or 20.0, self.most_deg or 1.0),
         )
-        with named_errors("--pose-convention", "convention"):
-            audit.convention_of(())
-        robot_body(model, (), without=self.without)  # refuses what is no robot
-        rows = None
-        if self.out is not None:  # other options have other results
-            asked = {**self.given, "workers": None, "ray": None, "json": None}
-            files = urdf.read_bytes(), self.camera.read_bytes()
-            digest = hashlib.sha256(repr((asked, files)).encode()).hexdigest()[:8]
-            rows = self.out.with_suffix(f".{digest}.rows")
-        audited = audit_episodes(
-            audit, episodes, rows, self.workers or cores(), self.ray
-        )
+        # Other options have other results.
+        asked = {**self.given, "workers": None, "ray": None, "json": None}
+        asked |= {"files": (urdf.read_bytes(), self.camera.read_bytes())}
+        digest = hashlib.sha256(repr(asked).encode()).hexdigest()[:8]
+        rows = self.out.with_suffix(f".{digest}.rows")
         results = []
         with progress_bar("episodes", total, "camera") as bar:
-            for result in audited:
+            for result in audit_episodes(
+                audit, episodes, rows, self.workers or cores(), self.ray
+            ):
                 results.append(result)
                 bar.update()
-        results = with_moves(results)
-        record = {"extrinsics": corrections(results), "episodes": []}
+        return self._corrected(with_moves(results), self.out)
+
+    def _corrected(self, results: "list[Audited]", out: Path) -> int:
+        from evercal.storage import write_json
+
+        record = {"extrinsics": {}, "episodes": []}
+        lines = []
         mistakes = Counter[str]()
         for result in results:
             record["episodes"].append(dataclasses.asdict(result))
             mistakes[result.verdict] += 1
-            if result.verdict != "right" and not self.json:
+            if result.corrected:
+                poses = record["extrinsics"].setdefault(result.episode, {})
+                poses[result.camera] = result.corrected
+            if result.verdict != "right":
                 what = f"{result.mistake}: " if result.mistake else ""
                 where = f"{result.episode} {result.camera}"
-                say(f"{result.verdict:8s} {where}: {what}{result.reason}")
-        if self.out is not None:
-            write_json(self.out, record)
+                lines.append(f"{result.verdict:8s} {where}: {what}{result.reason}")
+        write_json(out, record)
         wrong = mistakes["wrong"]
         line = f"{wrong} of {len(results)} camera poses are wrong"
-        self.answer(record, f"{line}, {mistakes['unknown']} unknown")
+        self.answer(record, *lines, f"{line}, {mistakes['unknown']} unknown")
         return 1 if wrong else 0

@@ -10,7 +10,7 @@ from evercal.calibration.audit_by_arm import ArmAudit, Audited
 from evercal.geometry import SE3
 from evercal.learning.many import each_done
 from evercal.learning.task import Item
-from evercal.recordings.episodes.episode import Episode, Numbers
+from evercal.recordings.episodes.episode import Episode
 from evercal.recordings.poses.conventions import poses_from_numbers
 from evercal.storage.text_files import named_errors
 
@@ -21,14 +21,14 @@ KNOWN = 2
 def audit_episodes(
     audit: ArmAudit,
     episodes: Iterable[Episode],
-    rows: Path | None = None,
+    rows: Path,
     workers: int = 1,
     ray: str | None = None,
 ) -> Iterator[Audited]:
     """Audit episodes, and yield results as they are ready.
 
     Args:
-        audit: The robot, and how poses are compared.
+        audit: How poses are compared.
         episodes: They are read while others are audited.
         rows: File of the results so far, a line for each; those in it are not audited again.
         workers: Processes; 1 for none beside this one.
@@ -54,18 +54,16 @@ def audit_episodes(
             convention = audit.convention_of(result.stated)
             pose = poses_from_numbers(result.corrected, convention)
             known.setdefault(result.camera, []).append(pose)
-        if rows is not None:
-            with open(rows, "a", encoding="utf-8") as file:
-                file.write(f"\n{json.dumps(asdict(result))}")
+        with open(rows, "a", encoding="utf-8") as file:
+            file.write(f"\n{json.dumps(asdict(result))}")
         yield result
 
 
-def _results(rows: Path | None) -> Iterator[Audited]:
+def _results(rows: Path) -> Iterator[Audited]:
     """The results in a file."""
-    if rows is None or not rows.exists():
-        return
-    with named_errors(rows, "results"):
-        for line in rows.read_text("utf-8").splitlines():
+    with open(rows, "a+", encoding="utf-8") as file, named_errors(rows, "results"):
+        file.seek(0)
+        for line in file:
             with suppress(json.JSONDecodeError):  # a kill cut it off
                 record = json.loads(line)
                 for name in ("stated", "corrected"):
@@ -88,18 +86,3 @@ def with_moves(results: Iterable[Audited]) -> list[Audited]:
             result = replace(result, mistake=f"moved since {first}")
         named.append(result)
     return named
-
-
-def corrections(results: Iterable[Audited]) -> dict[str, dict[str, Numbers]]:
-    """Camera poses by episode and camera in the notation of the data set.
-
-    They are as stated where that is right, else as the images show them.
-    """
-    poses: dict[str, dict[str, Numbers]] = {}
-    for result in results:
-        pose = result.corrected
-        if result.verdict == "right":
-            pose = result.stated
-        if pose:
-            poses.setdefault(result.episode, {})[result.camera] = pose
-    return poses

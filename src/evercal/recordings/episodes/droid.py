@@ -8,7 +8,7 @@ The stated pose is that of the left lens. The intrinsics are in the SVO files of
 they are given: a camera file, or the `intrinsics.json` that was published later for all episodes.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -45,21 +45,25 @@ def episodes(
             f"{root}: no data set; give the folder of meta/info.json (LeRobot), or one with"
             f" {_METADATA} in the folders of its episodes (DROID)"
         )
-    camera_of = _cameras(camera)
+    entries: JsonObject = {}
+    if camera.suffix == ".json":
+        entries = read_json(camera, "camera file")
+    lens = None
+    if "cameraMatrix" not in str(next(iter(entries.values()), "")):
+        lens = read_camera(camera)
 
     def each() -> Iterator[Episode]:
         for file in files:
+            name = file.stem.removeprefix("metadata_")
             try:
                 with library_errors(f"{file}: does not describe an episode of DROID"):
-                    found = [*_of(file)]
+                    found = [*_of(file, name)]
             except InputError as error:
-                name = file.stem.removeprefix("metadata_")
                 found = [Episode(name, problem=str(error))]
             yield from found
 
-    def _of(file: Path) -> Iterator[Episode]:
+    def _of(file: Path, name: str) -> Iterator[Episode]:
         data = read_json(file, "episode")
-        name = str(data["uuid"])
         stated = {}
         for number in _CAMERAS:
             pose = tuple(map(float, data[f"{number}_cam_extrinsics"]))
@@ -73,29 +77,19 @@ def episodes(
             video = file.parent / path_inside(f"recordings/MP4/{serial}.mp4", serial)
             videos = Videos.of(video)
             stored = [VideoFrame(videos, video, i * videos.step_s) for i in chosen]
-            frames = frames_of(stored, values[chosen], camera_of(name, serial))
+            own = lens or _camera(camera, entries, name, serial)
+            frames = frames_of(stored, values[chosen], own)
             yield Episode(name, serial, frames, names, stated)
 
     return len(files) * len(_CAMERAS), each()
 
 
-def _cameras(file: Path) -> Callable[[str, str], Camera]:
-    """Intrinsics by episode and serial number, or of all cameras."""
-    entries: JsonObject = {}
-    if file.suffix == ".json":
-        entries = read_json(file, "camera file")
-    if "cameraMatrix" not in str(next(iter(entries.values()), "")):
-        camera = read_camera(file)
-        return lambda *_: camera
-
-    def of(episode: str, serial: str) -> Camera:
-        entry = entries.get(episode, {}).get(serial)
-        if entry is None:
-            raise InputError(f"{file}: has no camera {serial} of {episode}")
-        fx, cx, fy, cy = map(float, entry["cameraMatrix"])
-        return Camera(entry["width"], entry["height"], fx, fy, cx, cy)
-
-    return of
+def _camera(file: Path, entries: JsonObject, episode: str, serial: str) -> Camera:
+    entry = entries.get(episode, {}).get(serial)
+    if entry is None:
+        raise InputError(f"{file}: has no camera {serial} of {episode}")
+    fx, cx, fy, cy = map(float, entry["cameraMatrix"])
+    return Camera(entry["width"], entry["height"], fx, fy, cx, cy)
 
 
 def joint_values(file: Path) -> Array:

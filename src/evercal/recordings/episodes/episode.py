@@ -12,10 +12,7 @@ from evercal.recordings.frame import Frame
 from evercal.recordings.images import StoredImage
 from evercal.recordings.poses.joint_tables import in_radians
 from evercal.robot.robot_model import RobotModel
-from evercal.typing import Array, Strings
-
-Numbers = tuple[float, ...]
-"""A pose as the data set writes it."""
+from evercal.typing import Array, Floats, Strings
 
 
 @frozen_arrays
@@ -30,7 +27,7 @@ class Episode:
     """Spread over the episode, taken where the arm is slow."""
     joints: Strings = ()
     """Names of the values in `Frame.joints_rad`."""
-    stated: Mapping[str, Numbers] = field(default_factory=dict)
+    stated: Mapping[str, Floats] = field(default_factory=dict)
     """Stated poses of all fixed cameras."""
     problem: str = ""
     """Why the episode cannot be read."""
@@ -52,18 +49,17 @@ def values_of_joints(
 ) -> tuple[Strings, Array]:
     """Names and values (n, k) of the joints of a URDF, from named numbers of a data set.
 
-    If the URDF knows none of the names, the numbers but the gripper's are its joints from the base.
+    If the URDF knows none of the names, the numbers but the gripper's are its first joints.
     """
     kept = [i for i, name in enumerate(names) if model.has_joint(name)]
     joints = [names[i] for i in kept]
     if not kept:
         kept = [i for i, name in enumerate(names) if "gripper" not in name.lower()]
-        chains = [model.arm(model.base_link, link).joints for link in model.links]
-        joints = [*max(chains, key=len)[: len(kept)]]
+        joints = model.drivers()[: len(kept)]
     if not 0 < len(kept) == len(joints):
         raise InputError(
-            f"{model.path}: its longest arm has {len(joints)} joints, the data set states"
-            f" {len(kept)}; give `urdf` of the robot"
+            f"{model.path}: has {len(joints)} joints that move, the data set states {len(kept)};"
+            f" give `urdf` of the robot"
         )
     values = in_radians(model, joints, values[:, kept], [unit] * len(kept))
     return tuple(joints), values

@@ -159,26 +159,39 @@ class Row(NamedTuple):
 
 
 def _rows(root: Path, column: str) -> tuple[list[Row], Array]:
+    rows: list[Row] = []
+    tables = []
+    for file in data_files(root):
+        found, values = rows_in(file, column)
+        rows += found
+        tables.append(values)
+    if not rows:
+        raise InputError(f"{root}: the dataset has no frames")
+    return rows, np.concatenate(tables)
+
+
+def data_files(root: Path) -> list[Path]:
+    """Tables of the rows."""
     files = files_in(root / "data", (".parquet",), "*/*")
     if not files:
         raise InputError(
             f"{root / 'data'}: no parquet files; download the data folder too"
         )
-    rows: list[Row] = []
-    tables = []
-    for file in files:
-        names = ["episode_index", "frame_index", "timestamp", column]
-        *cells, poses = columns(file, names)
-        for i, (episode, number, seconds) in enumerate(zip(*cells, strict=True)):
-            rows.append(Row(episode, number, seconds, file, i))
-        with named_errors(file, column):
-            values = number_array(poses, column)
-        if values.ndim != 2 or not np.isfinite(values).all():
-            raise InputError(f"{file}: {column} holds no rows of finite numbers")
-        tables.append(values)
-    if not rows:
-        raise InputError(f"{root}: the dataset has no frames")
-    return rows, np.concatenate(tables)
+    return files
+
+
+def rows_in(file: Path, column: str) -> tuple[list[Row], Array]:
+    """Rows of a table, and (n, k) numbers of a feature."""
+    names = ["episode_index", "frame_index", "timestamp", column]
+    *cells, poses = _columns(file, names)
+    rows = []
+    for i, (episode, number, seconds) in enumerate(zip(*cells, strict=True)):
+        rows.append(Row(episode, number, seconds, file, i))
+    with named_errors(file, column):
+        values = number_array(poses, column)
+    if values.ndim != 2 or not np.isfinite(values).all():
+        raise InputError(f"{file}: {column} holds no rows of finite numbers")
+    return rows, values
 
 
 def images_of(
@@ -188,47 +201,36 @@ def images_of(
     if info["features"][key]["dtype"] == "image":
         return [_Embedded(root, key, row.file, row.row) for row in rows]
     videos = Videos(float(info["fps"]))
-    episodes = {row.episode for row in rows}
-    starts = _video_starts(root, info, key, episodes)
-    lost = sorted(episodes - starts.keys())
-    if lost:
-        raise InputError(
-            f"{root / 'meta' / 'episodes'}: episode {lost[0]} is not listed"
-        )
+    template = str(info["video_path"])
+    starts: dict[int, tuple[Path, float]] = {}
+    if str(info["codebase_version"]).startswith("v2"):
+        size = int(info.get("chunks_size", 1000))
+        for i in {row.episode for row in rows}:
+            numbers = {"episode_chunk": i // size, "episode_index": i}
+            starts[i] = (_video(root, template, video_key=key, **numbers), 0.0)
+    else:
+        starts = _video_starts(root, template, key)
     frames: list[StoredImage] = []
     for row in rows:
+        if row.episode not in starts:
+            raise InputError(
+                f"{root / 'meta' / 'episodes'}: episode {row.episode} is not listed"
+            )
         path, start = starts[row.episode]
         frames.append(VideoFrame(videos, path, start + row.seconds))
     return frames
 
 
-def _video_starts(
-    root: Path, info: Info, key: str, episodes: set[int]
-) -> dict[int, tuple[Path, float]]:
-    """By episode: its video, and the time in the video at which it starts."""
-    video = functools.partial(_video, root, str(info["video_path"]), video_key=key)
-    starts: dict[int, tuple[Path, float]] = {}
-    if str(info["codebase_version"]).startswith("v2"):
-        size = int(info.get("chunks_size", 1000))
-        for i in episodes:
-            path = video(episode_chunk=i // size, episode_index=i)
-            starts[i] = (path, 0.0)
-        return starts
-    return _starts_in_files(root, str(info["video_path"]), key)
-
-
 @functools.lru_cache(maxsize=4)
-def _starts_in_files(
-    root: Path, template: str, key: str
-) -> dict[int, tuple[Path, float]]:
-    """The same, for all episodes of version 3."""
-    video = functools.partial(_video, root, template, video_key=key)
+def _video_starts(root: Path, template: str, key: str) -> dict[int, tuple[Path, float]]:
+    """By episode of version 3: its video, and the time in the video at which it starts."""
     starts: dict[int, tuple[Path, float]] = {}
     parts = ("chunk_index", "file_index", "from_timestamp")
     names = ["episode_index", *(f"videos/{key}/{part}" for part in parts)]
     for file in files_in(root / "meta" / "episodes", (".parquet",), "*/*"):
-        for episode, chunk, number, start in zip(*columns(file, names), strict=True):
-            path = video(chunk_index=chunk, file_index=number)
+        for episode, chunk, number, start in zip(*_columns(file, names), strict=True):
+            numbers = {"chunk_index": chunk, "file_index": number}
+            path = _video(root, template, video_key=key, **numbers)
             starts[int(episode)] = (path, float(start))
     return starts
 
@@ -252,8 +254,7 @@ def _parquet(path: Path) -> Iterator[Any]:
         yield table
 
 
-def columns(file: Path, names: list[str]) -> list[list[Any]]:
-    """Some columns of a table."""
+def _columns(file: Path, names: list[str]) -> list[list[Any]]:
     with _parquet(file) as table:
         read = table.read(columns=names)
         return [read[name].to_pylist() for name in names]
