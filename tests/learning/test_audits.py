@@ -5,13 +5,18 @@ from pathlib import Path
 import pytest
 
 from evercal.calibration.audit_by_arm import ArmAudit, Audited, Source
+from evercal.calibration.episode_images import EpisodeImages
 from evercal.learning.audits import audit_episodes, with_moves
 from evercal.recordings.episodes.episode import Episode
 
 
 @pytest.fixture
 def audit() -> ArmAudit:
-    return ArmAudit(pytest.fail)
+    return ArmAudit(unread)
+
+
+def unread(episode: Episode) -> EpisodeImages:
+    pytest.fail(f"{episode.name} was read")
 
 
 def broken(count: int) -> list[Episode]:
@@ -27,7 +32,7 @@ def test_an_audit_goes_on_after_a_kill(audit: ArmAudit, tmp_path: Path) -> None:
     assert whole.count(b"\n") == 2
     # The second line is cut off, so its episode is audited again.
     rows.write_bytes(whole[:-20])
-    audit_once = ArmAudit(lambda _: pytest.fail("read"))
+    audit_once = ArmAudit(unread)
     again = [*audit_episodes(audit_once, broken(4), rows)]
     assert again[0] == first[0]
     assert [result.reason for result in again] == [f"broken {i}" for i in range(4)]
@@ -54,7 +59,7 @@ def test_poses_of_earlier_episodes_are_handed_on(tmp_path: Path) -> None:
                 source[0].name, source[0].camera, corrected, "wrong", "", "", corrected
             )
 
-    noting = Noting(pytest.fail)
+    noting = Noting(unread)
     assert len([*audit_episodes(noting, broken(4), tmp_path / "rows")]) == 4
     assert handed == [[], [0], [0, 1], [1, 2]]
 

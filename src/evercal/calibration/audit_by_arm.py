@@ -104,7 +104,7 @@ class ArmAudit:
         images = self.look(episode)
         possible = self._readings(episode, images, result.stated)
         stated = possible.get("")
-        beside = stated and images.beside(stated)
+        beside = images.beside(stated) if stated else None
         if beside and beside.confirmed >= LEAST_CONFIRMED:
             result = self._compared(result, possible, beside)
             if result.verdict == "right":

@@ -14,7 +14,7 @@ from evercal.recordings.poses.conventions import (
 
 
 def readings(numbers: Sequence[float], stated: PoseConvention) -> dict[str, SE3]:
-    """Poses of numbers, if they are, as stated (by no words) and without one mistake (by its words)."""
+    """Poses by mistake in words: first as stated, by none, then without one mistake each."""
     length = replace(stated, metres_per_unit=0.001 / stated.metres_per_unit)
     conventions = {"": stated, "other unit of length": length}
     if stated.has_angles:

@@ -100,3 +100,17 @@ def test_images_are_taken_where_the_arm_is_slow() -> None:
     values = np.array([0, 0, 1, 2, 3, 3, 3, 5, 7, 7.0])[:, None]
     assert slow_rows(values, 2) == [0, 5]
     assert slow_rows(values[:1], 5) == [0]
+
+
+def test_a_matrix_and_a_pose_that_is_missing(tmp_path: Path) -> None:
+    """Tables hold a matrix as rows, and nan where an episode states none."""
+    made(tmp_path, "v2.1", "video")
+    for i, file in enumerate(sorted(tmp_path.glob("data/*/*.parquet"))):
+        table = pq.read_table(file).drop_columns([STATED])
+        pose = np.full((4, 4), 0.5)
+        pose[0, 3] = [0.5, np.nan, 0.5][i]
+        poses = [pose.tolist()] * len(table)
+        pq.write_table(table.append_column(STATED, pa.array(poses)), file)
+    first, second, _ = read(tmp_path)[1]
+    assert first.stated[STATED] == (0.5,) * 16
+    assert np.isnan(second.stated[STATED]).sum() == 1

@@ -18,9 +18,10 @@ from evercal.recordings.episodes.episode import (
 )
 from evercal.recordings.formats import lerobot
 from evercal.recordings.formats.lerobot_poses import STATE, Info, names_of
+from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.robot_model import RobotModel
-from evercal.storage.text_files import library_errors
+from evercal.storage.text_files import library_errors, named_errors
 
 _ON_THE_ARM = re.compile("wrist|hand|gripper")
 """Words in the names of cameras that move."""
@@ -47,9 +48,11 @@ def episodes(
             )
             poses = {}
             for place in filter(None, places.values()):
-                poses[place] = lerobot.rows_in(file, place)[1]
-            for number, own in groupby(range(len(rows)), lambda i: rows[i].episode):
-                of_episode = [*own]
+                (cells,) = lerobot.columns(file, [place])
+                with named_errors(file, place):
+                    poses[place] = number_array(cells, place).reshape(len(cells), -1)
+            for number, own in groupby(enumerate(rows), lambda row: row[1].episode):
+                of_episode = [i for i, _ in own]
                 first = of_episode[0]
                 stated = {place: tuple(poses[place][first].tolist()) for place in poses}
                 slow = slow_rows(values[of_episode], images)
@@ -68,9 +71,10 @@ def stated_features(root: Path, info: Info, wanted: str | None) -> dict[str, str
     """The feature that states the pose of each fixed camera; empty if there is none."""
     found = {}
     for key in lerobot.picture_keys(info):
-        name = key.rpartition(".")[2]
+        name = re.escape(key.rpartition(".")[2])
+        part = rf"(^|[._/]){name}($|[._/])"
         for feature in info["features"]:
-            if "extrinsic" in feature and feature.endswith(name):
+            if "extrinsic" in feature and re.search(part, feature):
                 found[key] = feature
     fixed = {key: found[key] for key in found if not _ON_THE_ARM.search(key)}
     if wanted is None and fixed:

@@ -183,7 +183,7 @@ def data_files(root: Path) -> list[Path]:
 def rows_in(file: Path, column: str) -> tuple[list[Row], Array]:
     """Rows of a table, and (n, k) numbers of a feature."""
     names = ["episode_index", "frame_index", "timestamp", column]
-    *cells, poses = _columns(file, names)
+    *cells, poses = columns(file, names)
     rows = []
     for i, (episode, number, seconds) in enumerate(zip(*cells, strict=True)):
         rows.append(Row(episode, number, seconds, file, i))
@@ -228,7 +228,7 @@ def _video_starts(root: Path, template: str, key: str) -> dict[int, tuple[Path, 
     parts = ("chunk_index", "file_index", "from_timestamp")
     names = ["episode_index", *(f"videos/{key}/{part}" for part in parts)]
     for file in files_in(root / "meta" / "episodes", (".parquet",), "*/*"):
-        for episode, chunk, number, start in zip(*_columns(file, names), strict=True):
+        for episode, chunk, number, start in zip(*columns(file, names), strict=True):
             numbers = {"chunk_index": chunk, "file_index": number}
             path = _video(root, template, video_key=key, **numbers)
             starts[int(episode)] = (path, float(start))
@@ -254,7 +254,8 @@ def _parquet(path: Path) -> Iterator[Any]:
         yield table
 
 
-def _columns(file: Path, names: list[str]) -> list[list[Any]]:
+def columns(file: Path, names: list[str]) -> list[list[Any]]:
+    """Some columns of a table."""
     with _parquet(file) as table:
         read = table.read(columns=names)
         return [read[name].to_pylist() for name in names]
