@@ -79,9 +79,6 @@ def test_primitives_have_the_stated_sizes(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.ptp(box.vertices, axis=0), (1, 2, 3))
     np.testing.assert_allclose(np.ptp(arm.vertices, axis=0), (1, 2, 1), atol=1e-3)
     np.testing.assert_allclose(arm.vertices.mean(0), (0, 0, 2), atol=1e-3)
-    assert body.notes == (
-        "joints without values stand at 0, or amid their limits: turn",
-    )
 
 
 def test_frames_are_those_of_the_joint_values(tmp_path: Path) -> None:
@@ -170,9 +167,6 @@ def test_collision_geometry_stands_for_visual_geometry_that_no_link_has(
 ) -> None:
     body = read(tmp_path, ROOT.replace("visual", "collision"))
     assert len(body.links) == 1
-    assert body.notes == (
-        "no link has visual geometry; collision geometry stands for it",
-    )
     distance = ROOT.replace("visual", "collision").replace("base", "arm")
     assert [link.link for link in read(tmp_path, ROOT + MOVED + distance).links] == [
         "base"

@@ -56,8 +56,6 @@ class RobotBody:
     """Links with a surface."""
     arms: tuple[Arm, ...]
     """Chain from the base to each of them."""
-    notes: Strings
-    """Joints without values, and use of collision geometry."""
 
     def frames(self, values: Array) -> Array:
         """(links, n, 4, 4) base_from_link of joint values (n, k), radians or metres."""
@@ -105,26 +103,15 @@ def robot_body(
     unknown = [link for link in without if link not in model.links]
     if unknown:
         raise InputError(f"{model.path}: has no link {few(unknown, model.links)}")
-    notes = []
     with named_errors(model.path, "mesh or URDF"):
         geometry = stated_geometry(model.path.read_bytes())
         shown = [part for part in geometry if part.kind == "visual"]
-        if not shown:
-            shown = geometry
-            notes.append(
-                "no link has visual geometry; collision geometry stands for it"
-            )
+        shown = shown or geometry
         links = _links(model.path, [part for part in shown if part.link not in without])
     if not links:
         raise InputError(f"{model.path}: no link has geometry, so images show none")
     arms = tuple(model.arm(base, link.link) for link in links)
-    named = dict.fromkeys(name for arm in arms for name in arm.joints)
-    still = [name for name in named if name not in joints]
-    if still:
-        notes.append(
-            f"joints without values stand at 0, or amid their limits: {', '.join(still)}"
-        )
-    return RobotBody(base, tuple(joints), tuple(links), arms, tuple(notes))
+    return RobotBody(base, tuple(joints), tuple(links), arms)
 
 
 def _rest(arm: Arm) -> Array:
