@@ -159,6 +159,10 @@ def test_nothing_is_accused_on_weak_evidence() -> None:
     shift = SE3.exp([0.04, 0, 0, 0, 0, 0]) @ TRUTH
     assert audited(numbers_of(shift), Shown()).verdict == "wrong"
     assert audited(numbers_of(shift), Shown(sigma_mm=15)).verdict == "unknown"
+    # Neither do they after a pose beside the stated one that was surely another.
+    shift = SE3.exp([0.08, 0, 0, 0, 0, 0]) @ TRUTH
+    wide = audited(numbers_of(shift), Shown(sigma_mm=40, at_stated=0.3))
+    assert wide.verdict == "unknown"
     # They show too little of the arm beside a pose that is right.
     hidden = Shown(confirmed=0.12, anywhere_too=False)
     hidden.near = lambda _: None  # pyright: ignore[reportAttributeAccessIssue]

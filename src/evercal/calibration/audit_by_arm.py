@@ -100,17 +100,17 @@ class ArmAudit:
     def _audited(self, episode: Episode, known: Sequence[SE3]) -> Audited:
         if episode.problem:
             raise InputError(episode.problem)
-        result = self.failed(0, (episode, known), "states no pose")
+        blank = self.failed(0, (episode, known), "states no pose")
         images = self.look(episode)
-        possible = self._readings(episode, images, result.stated)
+        possible = self._readings(episode, images, blank.stated)
         stated = possible.get("")
         beside = images.beside(stated) if stated else None
         if beside and beside.confirmed >= LEAST_CONFIRMED:
-            result = self._compared(result, possible, beside)
+            result = self._compared(blank, possible, beside)
             if result.verdict == "right":
                 return result
         found = images.near([*known, *possible.values()]) or images.anywhere()
-        result = self._compared(result, possible, found)
+        result = self._compared(blank, possible, found)
         if not beside or result.verdict != "wrong":
             return result
         same = self._agree(beside.base_from_camera.pose, found.base_from_camera.pose)
