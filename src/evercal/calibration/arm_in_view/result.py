@@ -27,6 +27,8 @@ DOUBTFUL_CONFIRMED = 0.3
 """Below it, there is a warning."""
 REFUSED_DEG = 0.25
 """Motion of the background from which a recording is refused: 7 mm at 1.6 m."""
+MESHES_RAD = 5e-4
+"""Standard deviation of joint offsets by meshes that are not quite the arm."""
 MOST_FOCAL = 0.015
 """Change of the focal length above which the intrinsics are doubtful."""
 _HALVES_D2 = 12.6
@@ -62,6 +64,9 @@ def calibration_of(
     stated = frames[0].camera
     estimated = stated.changed(fit.estimate.parameters[LENS])
     warnings = warnings_of(fit, fitter)
+    of_joints = covariance[JOINTS:, JOINTS:] + MESHES_RAD**2 * np.eye(
+        len(fit.estimate.offsets)
+    )
     calibration = Calibration(
         "eye_to_hand",
         fit.estimate.camera_from_base.inverse(),
@@ -72,8 +77,8 @@ def calibration_of(
         images=_uses(fit, frames),
         error_terms=tuple(terms),
         checks=_checks(fit, apart, warnings),
-        joints=_joints(fit, fitter, covariance),
-        joint_covariance=covariance[JOINTS:, JOINTS:],
+        joints=_joints(fit, fitter, of_joints),
+        joint_covariance=of_joints,
         source={
             "command": "arm-in-view",
             "frames": len(frames),
@@ -143,7 +148,7 @@ def _joints(fit: ArmFit, fitter: Fitter, covariance: Array) -> tuple[JointOffset
     for k, name in enumerate(body.joints):
         why = ""
         prior = fit.priors.sigma()[JOINTS + k]
-        sigma = float(np.sqrt(covariance[JOINTS + k, JOINTS + k]))
+        sigma = float(np.sqrt(covariance[k, k]))
         if not prior:
             why = "its offset turns the frame of the base: a mark at its zero shows it"
         elif sigma > 0.7 * prior:
