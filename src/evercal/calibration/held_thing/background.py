@@ -47,13 +47,13 @@ def motion_of_still(greys: Sequence[Image], still: BoolArray) -> Array:
         again = np.abs(back - points).max((1, 2)) < AGAIN_PX
         if again.sum() < max(LEAST_POINTS, len(points) / 3):
             continue
-        # With a turn about the optical axis; what moves by itself is an outlier.
-        _, inliers = cv2.estimateAffinePartial2D(
-            points[again], tracked[again], ransacReprojThreshold=2 * AGAIN_PX
+        # A camera that turns; what moves by itself is an outlier.
+        _, inliers = cv2.findHomography(
+            points[again], tracked[again], cv2.RANSAC, 2 * AGAIN_PX
         )
-        still_ones = inliers.ravel() > 0
-        if still_ones.mean() > 0.5:
-            motion[i] = (tracked - points)[again][still_ones].mean((0, 1))
+        if inliers is not None and inliers.mean() > 0.5:
+            shift = (tracked - points)[again]
+            motion[i] = np.median(shift[inliers.ravel() > 0], (0, 1))
     return motion
 
 
