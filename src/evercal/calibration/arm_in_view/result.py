@@ -25,6 +25,9 @@ LEAST_CONFIRMED = 0.2
 """Least share of the outline that the images show at the right pose."""
 DOUBTFUL_CONFIRMED = 0.3
 """Below it, there is a warning."""
+MOST_SCATTER = 1 / 640
+"""Standard deviation of the outlines from which there is a warning, in long sides of the image;
+right answers have 0.3 to 0.7 of it."""
 REFUSED_DEG = 0.25
 """Motion of the background from which a recording is refused: 7 mm at 1.6 m."""
 MESHES_RAD = 5e-4
@@ -165,6 +168,11 @@ def warnings_of(fit: ArmFit, fitter: Fitter) -> list[str]:
         warnings.append(
             f"the images show {100 * fit.confirmed:.0f} % of the outline of the arm only: look at"
             " the overlays, give more light, or take away what moves"
+        )
+    if fit.scale_px > MOST_SCATTER * max(fitter.views.size):
+        warnings.append(
+            f"the outlines of the arm scatter by {fit.scale_px:.1f} px: look at the overlays; the"
+            " URDF differs from the arm, people move, or the light changes"
         )
     focal = float(np.expm1(fit.estimate.parameters[FOCAL]))
     if abs(focal) > MOST_FOCAL:
