@@ -301,6 +301,10 @@ TABLES: dict[str, Callable[[], Table]] = {
         "condition,draws,refused,mm,deg,sigma_mm,sigma_deg,seconds",
         "arm-in-view-beside",
     ),
+    "arm-in-view: audit": _rows(
+        "mistake,poses,right,wrong,unknown,named,within,median_mm,median_deg,seconds",
+        "audit",
+    ),
     "boards: mistakes": _rows("mistake,draws,refused,warned,named,safe", "mistakes"),
     "boards: detection": _rows(
         "board,tilt_deg,finder,found,any_of_opencv,rms_px,ms", "boards"
