@@ -37,7 +37,7 @@ class Images:
 
     def __post_init__(self) -> None:
         grippers = self.base_from_gripper
-        if not grippers:
+        if grippers is None:
             return
         if not isinstance(grippers, SE3) or not grippers.shape:
             raise InputError(

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from evercal.classes import frozen
 from evercal.cli import args
@@ -18,7 +18,7 @@ from evercal.progress import progress_bar
 if TYPE_CHECKING:
     from evercal.calibration.audit_by_arm import Audited
 
-Tolerance = Annotated[float | None, arg(metavar="N")]
+Tolerance = Annotated[float | None, args.shown("N")]
 
 
 @frozen

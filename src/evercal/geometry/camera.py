@@ -130,7 +130,7 @@ class Camera:
             distortion=distortion,
         )
 
-    @property
+    @cached_property
     def size(self) -> Size:
         """Width and height of its images, pixels."""
         return self.width, self.height
@@ -206,7 +206,7 @@ class Camera:
 
     def short_side_resized(self, short_side: int) -> "Camera":
         """The camera of the image resized so that its shorter side is `short_side` pixels."""
-        scale = short_side / min(self.size)
+        scale = short_side / min(self.width, self.height)
         width = short_side
         height = short_side
         if self.width <= self.height:

@@ -58,17 +58,21 @@ class Frame:
 
 def posed_frames(frames: Iterable[Frame]) -> tuple[Frame, ...]:
     """Frames with a camera pose."""
-    return tuple(frame for frame in frames if frame.base_from_camera)
+    return tuple(frame for frame in frames if frame.base_from_camera is not None)
 
 
 def stated_poses(frames: Iterable[Frame]) -> SE3:
     """(n,) base_from_camera of the frames that have one."""
-    return SE3.stack([f.base_from_camera for f in frames if f.base_from_camera])
+    return SE3.stack(
+        [f.base_from_camera for f in frames if f.base_from_camera is not None]
+    )
 
 
 def stated_grippers(frames: Iterable[Frame]) -> SE3:
     """(n,) base_from_gripper of the frames that have one."""
-    return SE3.stack([f.base_from_gripper for f in frames if f.base_from_gripper])
+    return SE3.stack(
+        [f.base_from_gripper for f in frames if f.base_from_gripper is not None]
+    )
 
 
 @dataclass(frozen=True, eq=False)
