@@ -65,7 +65,7 @@ def images(body: RobotBody, values: np.ndarray, seed: int = 0) -> list[np.ndarra
     pose = BASE_FROM_CAMERA.inverse().matrix()
     shots = []
     for frames in body.frames(values).swapaxes(0, 1):
-        links = rasterizer.draw(pose @ frames, large).links
+        links = rasterizer.draw(pose @ frames, large)
         picture = np.where(links[..., None] >= 0, colours[links], background)
         small = cv2.resize(
             picture, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA

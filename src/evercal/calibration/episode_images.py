@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from evercal.calibration.arm_in_view.covariance import in_base, parts
+from evercal.calibration.arm_in_view.covariance import covariance_of, in_base, parts
 from evercal.calibration.arm_in_view.equations import ArmFit, TooFewPoints
 from evercal.calibration.arm_in_view.fit import Fitter
 from evercal.calibration.arm_in_view.result import LEAST_CONFIRMED
@@ -14,7 +14,6 @@ from evercal.calibration.arm_in_view.solve import fit_arm, priors_of
 from evercal.calibration.arm_in_view.starts import Overlap
 from evercal.calibration.arm_in_view.views import ArmViews
 from evercal.classes import frozen_arrays
-from evercal.errors import InputError
 from evercal.geometry import SE3, UncertainPose
 from evercal.recordings.episodes.episode import Episode
 from evercal.robot.link_shapes import RobotBody
@@ -44,8 +43,6 @@ class EpisodeImages:
         body = replace(body, joints=episode.joints)
         self._fitter = Fitter(ArmViews.of(episode.frames, body))
         self._priors = priors_of(body, ArmErrors())
-        if not self._fitter.moving.any():
-            raise InputError("the arm does not move in the images")
 
     def links(self) -> dict[str, SE3]:
         """base_from_link of the links that move, in the first image."""
@@ -88,7 +85,7 @@ class EpisodeImages:
         reaches: Sequence[float],
         is_final: bool = False,
     ) -> ArmPose:
-        zoom = max(0.5, max(self._fitter.views.size) / 640)
+        zoom = max(0.5, max(self._fitter.views.camera.size) / 640)
         try:
             found = self._fitter.fit(
                 self._fitter.start(start.inverse()),
@@ -104,6 +101,6 @@ class EpisodeImages:
 
 
 def _pose(fit: ArmFit) -> ArmPose:
-    whole = sum((part for part, _ in parts(fit).values()), np.zeros(()))
+    whole = covariance_of(parts(fit))
     pose = fit.estimate.camera_from_base.inverse()
     return ArmPose(UncertainPose(pose, in_base(fit, whole)), fit.confirmed)

@@ -10,7 +10,6 @@ from evercal.calibration.arm_in_view.equations import Estimate, Priors
 from evercal.calibration.arm_in_view.fit import Fitter
 from evercal.calibration.arm_in_view.outline import (
     image_offsets,
-    link_edges,
     outline_points,
 )
 from evercal.calibration.arm_in_view.solve import chosen_frames
@@ -74,8 +73,7 @@ def _drawn(fitter: Fitter, estimate: Estimate, i: int) -> Image:
     base_from_link = views.body.frames(values)[:, 0]
     drawing = fitter.draw(estimate, base_from_link)
     links = estimate.camera_from_base.matrix() @ base_from_link
-    edges = [*map(link_edges, views.body.links)]
-    points = outline_points(edges, links, estimate.camera, drawing, 1.0)
+    points = outline_points(fitter.edges, links, estimate.camera, drawing, 1.0)
     offsets = image_offsets(views, i, points, _REACHES_PX[-1])
     picture = resized(views.images[i], PICTURE_PX)
     pixels = resize_pixels(points.pixels, PICTURE_PX / views.camera.width)

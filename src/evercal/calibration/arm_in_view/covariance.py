@@ -65,11 +65,14 @@ def parts(fit: ArmFit, free: BoolArray | None = None) -> dict[str, tuple[Array, 
     return found
 
 
+def covariance_of(by_name: dict[str, tuple[Array, str]]) -> Array:
+    """(10 + k, 10 + k) the sum of `parts`."""
+    return np.sum([part for part, _ in by_name.values()], 0)
+
+
 def lens_covariance(fit: ArmFit) -> Array:
     """(3, 3) of focal length and principal point, by their prior and the images."""
-    with_lens = parts(fit, _with_lens(fit))
-    covariance = np.sum([part for part, _ in with_lens.values()], 0)
-    return covariance[LENS, LENS]
+    return covariance_of(parts(fit, _with_lens(fit)))[LENS, LENS]
 
 
 def focal_sigmas(fit: ArmFit) -> float:

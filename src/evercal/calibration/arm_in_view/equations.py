@@ -15,7 +15,6 @@ from evercal.typing import Array, BoolArray, IntArray
 
 POSE = slice(0, 6)
 FOCAL = 6
-CENTRE = slice(7, 9)
 LENS = slice(6, 9)
 OUTLINE = 9
 JOINTS = 10

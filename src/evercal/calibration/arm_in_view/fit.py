@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from evercal.calibration.arm_in_view.equations import (
@@ -20,14 +21,16 @@ from evercal.calibration.arm_in_view.outline import (
     link_edges,
     outline_points,
 )
-from evercal.calibration.arm_in_view.rasterizer import Drawing, Rasterizer
+from evercal.calibration.arm_in_view.rasterizer import Rasterizer
 from evercal.calibration.arm_in_view.views import ArmViews
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.typing import Array, BoolArray
+from evercal.typing import Array, BoolArray, IntArray
 
 _FIRST_STEPS = 2
 """Steps of a final fit before the size of joint offsets is estimated."""
+_MOVES = 0.3
+"""Least way of the middle of a link that moves, in its sizes."""
 _ROUGH = 0.004
 """Cells in which vertices are merged where only the place of links counts, in reaches."""
 
@@ -41,7 +44,8 @@ class Shown(NamedTuple):
     """(links, 4, 4)."""
     slopes: Array
     """(links, 6, k) see `RobotBody.slopes`."""
-    drawing: Drawing
+    drawing: IntArray
+    """(h, w) see `Rasterizer.draw`."""
 
 
 class Search(NamedTuple):
@@ -65,7 +69,7 @@ class Fitter:
         shapes = views.body.links
         rough = [shape.simplified(_ROUGH * self.reach_m()) for shape in shapes]
         self._rasterizer = Rasterizer(rough)
-        self._edges = [*map(link_edges, shapes)]
+        self.edges = [*map(link_edges, shapes)]
         self._rough_edges = [*map(link_edges, rough)]
 
     def fit(
@@ -91,7 +95,7 @@ class Fitter:
             drawings = [self.draw(estimate, frames[:, i]) for i in images]
             if is_final and not number:
                 self._learn(images, drawings, reach)
-            edges = self._edges if is_final else self._rough_edges
+            edges = self.edges if is_final else self._rough_edges
             search = Search(edges, reach, spacing_px)
             rows = []
             for i, drawing in zip(images, drawings, strict=True):
@@ -109,8 +113,6 @@ class Fitter:
         """Radius of the space in which the links move, metres."""
         frames = self.views.body.frames(self.views.values)
         places = frames[self.moving, :, :3, 3].reshape(-1, 3)
-        if not len(places):
-            return 0.0
         return float(np.linalg.norm(places - places.mean(0), axis=1).max())
 
     def start(self, camera_from_base: SE3) -> Estimate:
@@ -118,20 +120,18 @@ class Fitter:
         count = JOINTS + len(self.views.body.joints)
         return Estimate(camera_from_base, self.views.camera, np.zeros(count))
 
-    def draw(self, estimate: Estimate, base_from_link: Array) -> Drawing:
+    def draw(self, estimate: Estimate, base_from_link: Array) -> IntArray:
         """Draw the arm with link poses (links, 4, 4)."""
         pose = estimate.camera_from_base.matrix()
         return self._rasterizer.draw(pose @ base_from_link, estimate.camera)
 
     def _learn(
-        self, images: Sequence[int], drawings: Sequence[Drawing], reach: float
+        self, images: Sequence[int], drawings: Sequence[IntArray], reach: float
     ) -> None:
-        import cv2
-
         covered = np.ones(self.views.images.shape[:3], bool)
         side = 2 * max(round(reach), 3) + 1
         for i, drawing in zip(images, drawings, strict=True):
-            arm = (drawing.links >= 0).astype(np.uint8)
+            arm = (drawing >= 0).astype(np.uint8)
             covered[i] = cv2.dilate(arm, np.ones((side, side), np.uint8)) > 0
         self.views.learn_background(covered)
 
@@ -144,7 +144,7 @@ class Fitter:
         )
         points = points.at(self.moving[points.link])
         offsets = image_offsets(self.views, shown.number, points, search.reach_px)
-        count = len(self._edges)
+        count = len(self.edges)
         testable = np.bincount(points.link[offsets.testable], minlength=count)
         testable = testable.astype(float)
         points = points.at(offsets.confirmed)
@@ -198,7 +198,3 @@ def moving_links(views: ArmViews) -> BoolArray:
         size = np.linalg.norm(np.ptp(corners, 0))
         moving.append(np.linalg.norm(np.ptp(middle, 0)) > _MOVES * size)
     return np.array(moving)
-
-
-_MOVES = 0.3
-"""Least way of the middle of a link that moves, in its sizes."""

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from evercal.calibration.arm_in_view.rasterizer import Drawing
 from evercal.calibration.arm_in_view.views import ArmViews
 from evercal.geometry import Camera, unit_vectors
 from evercal.robot.link_shapes import LinkShape
@@ -51,8 +50,6 @@ class OutlinePoints(NamedTuple):
 
     link: IntArray
     """(m,) number of the link."""
-    on_link: Array
-    """(m, 3) in the frame of the link."""
     in_camera: Array
     """(m, 3)."""
     pixels: Array
@@ -64,7 +61,6 @@ class OutlinePoints(NamedTuple):
         """Some of the points."""
         return OutlinePoints(
             self.link[chosen],
-            self.on_link[chosen],
             self.in_camera[chosen],
             self.pixels[chosen],
             self.normals[chosen],
@@ -97,7 +93,7 @@ def outline_points(
     edges: list[LinkEdges],
     camera_from_link: Array,
     camera: Camera,
-    drawing: Drawing,
+    drawing: IntArray,
     spacing_px: float,
 ) -> OutlinePoints:
     """Points every `spacing_px` along the outline of an arm with link poses (links, 4, 4)."""
@@ -117,7 +113,6 @@ def outline_points(
         parts.append(
             OutlinePoints(
                 owner,
-                on_link,
                 in_camera,
                 pixels,
                 normals,
@@ -168,13 +163,13 @@ def _sampled(
     return points, along[edge] / length[edge, None]
 
 
-def _link_at(drawing: Drawing, pixels: Array) -> IntArray:
+def _link_at(drawing: IntArray, pixels: Array) -> IntArray:
     """(m,) number of the link that is drawn at pixels (m, 2), -1 for none, -2 outside."""
-    height, width = drawing.links.shape
+    height, width = drawing.shape
     x, y = np.rint(pixels).astype(int).T
     inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
     numbers = np.full(len(pixels), -2)
-    numbers[inside] = drawing.links[y[inside], x[inside]]
+    numbers[inside] = drawing[y[inside], x[inside]]
     return numbers
 
 

@@ -1,14 +1,13 @@
-"""`Rasterizer`: which link of an arm each pixel of a pinhole camera shows, and how far it is."""
+"""`Rasterizer`: which link of an arm each pixel of a pinhole camera shows."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from evercal.geometry import Camera
 from evercal.robot.link_shapes import LinkShape
-from evercal.typing import Array, Float32Array, IntArray
+from evercal.typing import Array, IntArray
 
 _NEAR_M = 0.05
 """Nearer surfaces are not drawn."""
@@ -16,15 +15,6 @@ _FAR_M = 50.0
 """Distance of pixels without a surface."""
 _SHADES = 256
 """Links are drawn as shades of grey, which hold this many numbers."""
-
-
-class Drawing(NamedTuple):
-    """An arm as one image shows it."""
-
-    links: IntArray
-    """(h, w) number of the link, -1 where there is none."""
-    depth: Float32Array
-    """(h, w) metres along the optical axis."""
 
 
 class Rasterizer:
@@ -46,8 +36,8 @@ class Rasterizer:
         settings = settings.setCullingMode(cv2.RASTERIZE_CULLING_NONE)
         self._settings = settings.setShadingType(cv2.RASTERIZE_SHADING_FLAT)
 
-    def draw(self, camera_from_link: Array, camera: Camera) -> Drawing:
-        """Draw links at poses (links, 4, 4).
+    def draw(self, camera_from_link: Array, camera: Camera) -> IntArray:
+        """Draw links at poses (links, 4, 4): (h, w) number of the link, -1 where there is none.
 
         OpenCV's rasterizer has its principal point in the middle of the image and one focal
         length. So a larger image is drawn of points that are sheared, and cropped.
@@ -83,7 +73,7 @@ class Rasterizer:
         rows = slice(half_height - top, half_height - top + camera.height)
         columns = slice(half_width - left, half_width - left + camera.width)
         numbers = np.rint(shade[rows, columns, 0] * _SHADES).astype(np.int64)
-        return Drawing(numbers - 1, depth[rows, columns])
+        return numbers - 1
 
 
 def _half(centre: float, size: int) -> int:

@@ -6,7 +6,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from evercal.calibration.arm_in_view.covariance import SCATTER, halves, in_base, parts
+from evercal.calibration.arm_in_view.covariance import (
+    SCATTER,
+    covariance_of,
+    halves,
+    in_base,
+    parts,
+)
 from evercal.calibration.arm_in_view.equations import FOCAL, JOINTS, LENS, POSE, ArmFit
 from evercal.calibration.arm_in_view.fit import Fitter
 from evercal.calibration.calibration import Calibration, ErrorTerm
@@ -47,7 +53,7 @@ def calibration_of(
 ) -> Calibration:
     """The calibration of a camera whose frames (n,) were fitted."""
     whole = parts(fit)
-    covariance = sum((part for part, _ in whole.values()), np.zeros(()))
+    covariance = covariance_of(whole)
     of_pose = in_base(fit, covariance)
     terms = [
         ErrorTerm.of(name, in_base(fit, part), cause)
@@ -169,7 +175,7 @@ def warnings_of(fit: ArmFit, fitter: Fitter) -> list[str]:
             f"the images show {100 * fit.confirmed:.0f} % of the outline of the arm only: look at"
             " the overlays, give more light, or take away what moves"
         )
-    if fit.scale_px > MOST_SCATTER * max(fitter.views.size):
+    if fit.scale_px > MOST_SCATTER * max(fitter.views.camera.size):
         warnings.append(
             f"the outlines of the arm scatter by {fit.scale_px:.1f} px: look at the overlays; the"
             " URDF differs from the arm, people move, or the light changes"

@@ -135,7 +135,7 @@ def fit_arm(
         InputError: The arm does not move, or the images do not show it where it should be.
     """
     views = fitter.views
-    zoom = max(views.size) / 640
+    zoom = max(views.camera.size) / 640
     if start is None:
         best = _best_start(fitter, priors, zoom, on_progress).estimate
     else:

@@ -37,7 +37,7 @@ class Overlap:
     """Compares masks with convex hulls of the links."""
 
     def __init__(self, views: ArmViews, moving: BoolArray) -> None:
-        scale = WIDTH_PX / max(views.size)
+        scale = WIDTH_PX / max(views.camera.size)
         self.masks = views.masks(scale)
         height, width = self.masks.shape[1:]
         self.camera = views.camera.resized(width, height)

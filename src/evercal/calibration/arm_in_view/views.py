@@ -78,11 +78,6 @@ class ArmViews:
     def __len__(self) -> int:
         return len(self.images)
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height."""
-        return self.camera.width, self.camera.height
-
     def _of_same_brightness(self, middle: Array) -> None:
         """Compute the gains (n, 3) of the images against their median over time."""
         bright = self.valid & (middle.min(-1) > _DARK)
