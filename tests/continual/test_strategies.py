@@ -1,9 +1,11 @@
 """The list of strategies, their descriptions, and strategies from a user's file."""
 
 import json
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -134,3 +136,31 @@ def test_invalid_plugins_are_refused(tmp_path: Path, text: str, message: str) ->
     for name in ("none.py", "mine.txt"):
         with pytest.raises(InputError, match=r"ends in \.py"):
             load_plugin(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "weighted"),
+    [
+        ("er", lambda method: method.weight),
+        ("mir", lambda method: method.weight),
+        ("lwf", lambda method: method.weight),
+        ("evercal_network", lambda method: method.weight),
+        ("sars_spdd", lambda method: method.penalty.scale * method.weight),
+        ("gec", lambda method: method.alpha),
+        ("ewc", lambda method: method.strength),
+    ],
+)
+def test_a_method_has_one_weight(name: str, weighted: Callable[[Any], float]) -> None:
+    strategy = strategy_named(name)
+    other = strategy.weighted(0.125)
+    assert weighted(other.method) == 0.125 != weighted(strategy.method)
+    assert strategy.weighted(weighted(strategy.method)) == strategy
+
+
+def test_a_weight_is_refused_by_name() -> None:
+    for name in ("evercal", "finetune", "isolation", "joint"):
+        with pytest.raises(InputError, match=f"`weight` 2.0: strategy '{name}'"):
+            strategy_named(name).weighted(2.0)
+    for weight in (-1.0, math.nan, math.inf):
+        with pytest.raises(InputError, match="give a number >= 0"):
+            strategy_named("er").weighted(weight)

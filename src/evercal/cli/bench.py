@@ -2,15 +2,18 @@
 
 import dataclasses
 import itertools
+from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from evercal.choices import Preset
 from evercal.classes import frozen
 from evercal.cli import args
-from evercal.cli.console import say
+from evercal.cli.training import Training, observer
 from evercal.errors import InputError
+from evercal.progress import Bars
 
 if TYPE_CHECKING:
     from evercal.continual.benchmark.bench import CompletedStage
@@ -19,12 +22,8 @@ if TYPE_CHECKING:
     from evercal.recordings import Recording
 
 
-LEAST_BATCH = 64
-"""Smallest number of rows in a step that learns anything."""
-
-
 @frozen
-class Bench(args.Verb):
+class Bench(args.Verb, Training):
     """Compare strategies on a sequence of scenes; the same command resumes.
 
     Given a folder of results, print its tables again.
@@ -56,25 +55,12 @@ class Bench(args.Verb):
     original poses."""
     parts: int = 4
     """Stages that the suite regions splits a scene into."""
-    preset: Literal["fast", "demo", "bench", "converged", "paper"] = "bench"
-    """Training effort per stage."""
-    backbone: Literal["evercal", "paper", "paper_head"] = "evercal"
-    """Network: ours, or the paper's with all centres given in advance, trained by its optimiser
-    and loss (paper) or by ours (paper_head)."""
-    offsets: Literal["per_centre", "shared"] = "per_centre"
-    """One offset and scale per centre (the paper), or one for all centres (GLACE)."""
-    steps: args.Count = None
-    """Optimiser steps of a stage. Defaults to that of the preset."""
-    batch: args.Count = None
-    """Rows of the new scene in a step; replayed rows keep the preset's proportion. Defaults to that
-    of the preset."""
+    preset: Preset = field(default="bench", kw_only=True)
+    """Training effort per stage; paper needs a GPU."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
     """Keyframes to keep of a scene: a share of its frames (10%) or bytes (5MB)."""
     held_out: bool = False
     """Evaluate on a fifth of the training frames instead of the test frames, to choose settings."""
-    device: args.Device = "auto"
-    plugin: Annotated[Path | None, args.shown("FILE.py")] = None
-    """Python file of your own strategies (see examples/my_strategy.py)."""
     out: args.OutFolder = Path("evercal-bench")
     """Folder of results. The same command resumes there; in a second process it shares the runs."""
 
@@ -85,10 +71,8 @@ class Bench(args.Verb):
         from evercal.continual.benchmark.bench import BenchOptions, run_bench
         from evercal.continual.benchmark.suites import tuning_split
         from evercal.continual.learning.presets import short_side
-        from evercal.continual.strategies import load_plugin
 
-        if self.plugin:
-            load_plugin(self.plugin)
+        self.load_plugin()
         strategies = self._strategies()  # refused before recordings are read
         scenes = self._recorded()
         judged = "test frames"
@@ -106,8 +90,10 @@ class Bench(args.Verb):
             settings={"suite": self.suite, "poses": poses, "judged": judged},
             device=self.device,
         )
-        for step in run_bench(scenes, options, self.out):
-            say(_progress(step), self.log)
+        with Bars(self.log) as bars:
+            options = dataclasses.replace(options, on_event=observer(bars))
+            for step in run_bench(scenes, options, self.out):
+                bars.write(_progress(step))
         return self._show(self.out, strategies[0].name)
 
     def _show(self, folder: Path, reference: str = "") -> int:
@@ -151,35 +137,12 @@ class Bench(args.Verb):
         return load_suite(self.suite, self.data, _words(self.scenes), self.poses)
 
     def _stage(self, seed: int) -> "StageOptions":
-        from evercal.continual.learning.presets import (
-            BACKBONES,
-            PAPER_SIM_STEPS,
-            preset,
-        )
+        from evercal.continual.learning.presets import PAPER_SIM_STEPS
 
-        try:
-            stage = preset(self.preset, seed).with_memory(self.memory)
-        except InputError as error:
-            raise InputError(f"--{error}") from None
-        backbone = "paper" if self.preset == "paper" else self.backbone
-        stage = BACKBONES[backbone](stage)
-        steps = stage.fit.iterations
+        given = self
         if self.preset == "paper" and self.suite.startswith("sim"):
-            steps = PAPER_SIM_STEPS
-        if self.steps is not None:
-            steps = self.steps
-        if steps < 1:
-            raise InputError(f"--steps {steps}: give a number >= 1")
-        fit = dataclasses.replace(stage.fit, iterations=steps)
-        if self.batch is not None:
-            if self.batch < LEAST_BATCH:
-                raise InputError(
-                    f"--batch {self.batch}: give a number >= {LEAST_BATCH}"
-                )
-            replayed = fit.replay_batch * self.batch // fit.batch
-            fit = dataclasses.replace(fit, batch=self.batch, replay_batch=replayed)
-        head = dataclasses.replace(stage.head, offsets=self.offsets)
-        return dataclasses.replace(stage, head=head, fit=fit)
+            given = dataclasses.replace(self, steps=self.steps or PAPER_SIM_STEPS)
+        return given.stage(seed, self.memory, "fixed")
 
 
 def _progress(step: "CompletedStage") -> str:

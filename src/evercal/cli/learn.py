@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from evercal.choices import Preset
 from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.calibrate import held_out_lines, joint_lines, lens_lines
 from evercal.cli.console import require_writable, say, say_notes, size
 from evercal.cli.info import adjusted_row
+from evercal.cli.training import Training, observer
 from evercal.errors import InputError
 from evercal.progress import Bars
 
@@ -31,16 +31,14 @@ FEW_LANDMARKS = 50
 
 
 @frozen
-class NetworkOptions:
+class NetworkOptions(Training):
     """Options of strategies that train a network; a map refuses them."""
 
-    preset: Preset = "fast"
-    """Amount of training: fast takes minutes on two cores, paper needs a GPU."""
-    centres: Annotated[int | None, args.shown("M")] = None
-    """Cluster centres that a scene adds to the network. Default: those of the preset."""
+    weight: Annotated[float | None, args.shown("W")] = None
+    """Weight of what protects earlier scenes: the strategy's weight, scale of SPDD, alpha of GEC or
+    strength of EWC. Default: that of the strategy."""
     seed: int = 0
     """Random seed."""
-    device: args.Device = "auto"
 
     def refuse(self) -> None:
         """Refuse options that a map does not have."""
@@ -263,30 +261,24 @@ def learn_into_networks(
         NetworkLearnOptions,
         learn_networks,
     )
-    from evercal.continual.learning.stage import Encoding
-    from evercal.continual.networks.trainer import Progress
+    from evercal.continual.strategies import strategy_named
 
     wanted = given.networks
-    if wanted.centres is not None and wanted.centres < 1:
-        raise InputError(f"--centres {wanted.centres}: give a number >= 1")
     if wanted.seed < 0:
         raise InputError(f"--seed {wanted.seed}: give a number >= 0")
-
-    def show(event: object) -> None:
-        if isinstance(event, Progress):
-            bar = bars.step("training", event.step, event.total)
-            text = f"loss {event.loss:.1f}, {100 * event.inlier_share:.0f} % inliers"
-            bar.set_postfix_str(text, refresh=event.step == event.total)
-        elif isinstance(event, Encoding):
-            bars.step("encoding", event.done, event.total)
-
+    wanted.load_plugin()
+    chosen = strategy_named(strategy)
+    if wanted.weight is not None:
+        chosen = chosen.weighted(wanted.weight)
     options = NetworkLearnOptions(
-        strategy=strategy,
-        memory=given.memory or "10%",
+        strategy=chosen,
+        preset=wanted.preset,
+        stage=wanted.stage(wanted.seed, given.memory or "10%"),
+        centres=wanted.centres,
         encoder=given.encoder,
-        **vars(wanted),
+        device=wanted.device,
     )
-    return learn_networks(given.store, recording, options, show)
+    return learn_networks(given.store, recording, options, observer(bars))
 
 
 def summary(report: "LearnReport", file: Path) -> Iterator[str]:

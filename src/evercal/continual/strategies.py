@@ -1,7 +1,9 @@
 """Strategies by name, and those of a user's file."""
 
 import importlib.util
+import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeGuard
 
@@ -44,6 +46,16 @@ class Strategy:
         if self.source or not self.method:
             return self.source
         return self.method.citation
+
+    def weighted(self, weight: float) -> "Strategy":
+        """Copy the strategy with another weight of what protects earlier scenes."""
+        if not 0 <= weight < math.inf:
+            raise InputError(f"`weight` {weight}: give a number >= 0")
+        if not self.method or not self.method.weight_field:
+            raise InputError(
+                f"`weight` {weight}: strategy {self.name!r} protects no scene; omit it"
+            )
+        return replace(self, method=self.method.weighted(weight))
 
     def description(self) -> JsonObject:
         """Convert to plain data: method with hyper-parameters, map, joint training."""
@@ -105,7 +117,10 @@ def strategy_named(name: str) -> Strategy:
     """Return a strategy by name."""
     if name not in STRATEGIES:
         names = ", ".join(STRATEGIES)
-        raise InputError(f"strategy {name!r}: unknown; choose one of {names}")
+        raise InputError(
+            f"strategy {name!r}: unknown; choose one of {names}, or name the file that defines it"
+            " by `plugin`"
+        )
     return STRATEGIES[name]
 
 

@@ -24,7 +24,7 @@ from evercal.continual.learning.learn_networks import (
     NetworkLearnOptions,
     learn_networks,
 )
-from evercal.continual.learning.stage import StageOptions
+from evercal.continual.learning.stage import OnEvent, StageOptions, unobserved
 from evercal.continual.learning.stage_rows import StageRows
 from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer
 from evercal.continual.networks.atlas import combined_centres
@@ -72,6 +72,8 @@ class BenchOptions:
     """Further settings that decide the results, for settings.json."""
     device: str = "auto"
     """Device of the networks, see `networks.device.device_of`."""
+    on_event: OnEvent = unobserved
+    """Called with every event of a training, for progress bars."""
 
 
 def run_strategy(
@@ -110,6 +112,7 @@ class _Run:
         self.out = out
         self.device = device_of(options.device)
         self.short_side = options.short_side
+        self.on_event = options.on_event
         self.stage = _with_centres(options.stage(seed), scenes)
         self.features = out.absolute() / "features"
         self.store = out / "runs" / f"{strategy.name}-{seed}"
@@ -202,7 +205,7 @@ class _NetworkRun(_Run):
             recordings.append(replace(scene, train=split.train))
             held_out.append(split.held_out)
         began = perf_counter()
-        learned = learn_jointly(empty, recordings, self.stage)
+        learned = learn_jointly(empty, recordings, self.stage, self.on_event)
         for number, frames in enumerate(held_out):
             learned.scenes[number] = fit_threshold(learned, frames, number)
         seconds = perf_counter() - began
@@ -220,7 +223,7 @@ class _NetworkRun(_Run):
             device=str(self.device),
             cache=self.features,
         )
-        learn_networks(store, scene, options)
+        learn_networks(store, scene, options, self.on_event)
 
     def _new_store(self) -> NetworkStore:
         return NetworkStore.create(self.store, self.strategy.name, self.short_side)

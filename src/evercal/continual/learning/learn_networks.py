@@ -1,7 +1,8 @@
 """`learn_networks`: what the command line calls to learn a scene into a store of networks."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import field, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -42,45 +43,26 @@ class NetworkLearnOptions:
 
     strategy: str | Strategy = "evercal_network"
     """The strategy or its name; a store keeps the one it was made with."""
+    stage: StageOptions = field(default_factory=partial(preset, "fast"))
+    """Options of the stage."""
     preset: str = "fast"
-    """Amount of training, see `presets`."""
-    memory: str | int = "10%"
-    """Keyframes of a scene, see `MemoryBudget.parse`."""
+    """Name of the preset of `stage`, for the working size of a new store and for the report."""
     centres: int | None = None
-    """Cluster centres that a scene adds; those of the preset by default."""
+    """Cluster centres of a scene that the store must have been made with; None for any number."""
     encoder: Path | None = None
     """An ONNX file for a new store."""
     device: str = "auto"
     """Device of the networks, see `device_of`."""
-    seed: int = 0
-    """Seed of all random draws."""
-    stage: StageOptions | None = None
-    """Options of the stage in place of preset, memory and centres."""
     short_side: int | None = None
     """Working size of images in a new store, pixels; that of the preset by default."""
     cache: Path | None = None
     """Folder for features of views, for many runs over the same frames."""
 
-    def stage_options(self) -> StageOptions:
-        """Options of the stage."""
-        if self.stage:
-            return self.stage
-        stage = preset(self.preset, self.seed).with_memory(self.memory)
-        if self.centres is None:
-            return stage
-        if self.centres < 1:
-            raise InputError(f"`centres` {self.centres}: give a number >= 1")
-        return replace(stage, head=replace(stage.head, centres_per_scene=self.centres))
-
     def opened(
-        self,
-        store: Path,
-        strategy: Strategy,
-        stage: StageOptions,
-        frames: Sequence[Frame],
+        self, store: Path, strategy: Strategy, frames: Sequence[Frame]
     ) -> NetworkStore:
         """Open the store of a strategy or make it; `frames` are those of the scene to learn."""
-        if stage.memory.auto:
+        if self.stage.memory.auto:
             raise InputError(
                 "memory auto: only a map selects its keyframes; give a share or bytes"
             )
@@ -126,7 +108,7 @@ def learn_networks(
         on_event: called with every event, for progress bars.
     """
     began = perf_counter()
-    stage = options.stage_options()
+    stage = options.stage
     strategy = options.strategy
     if isinstance(strategy, str):
         strategy = strategy_named(strategy)
@@ -135,7 +117,7 @@ def learn_networks(
             f"strategy {strategy.name!r}: does not train a network scene by scene; use another"
             " strategy, or compare it with 'evercal bench'"
         )
-    opened = options.opened(store, strategy, stage, recording.train)
+    opened = options.opened(store, strategy, recording.train)
     with opened.writing():
         contents = opened.contents.to(device_of(options.device))
         taken = [record.name for record in contents.scenes]

@@ -26,6 +26,7 @@ class ElasticWeightConsolidation(Method):
     """
 
     citation = "Kirkpatrick et al., PNAS 2017"
+    weight_field = "strength"
     strength: float = 1e6
     """Weight of the mean squared change, weighted by importances of mean 1."""
     images: int = 200

@@ -39,6 +39,7 @@ class EpisodicConstraint(EpisodicMemory):
     """
 
     citation = "Lai et al., GEC, NeurIPS 2025, several constraints"
+    weight_field = "alpha"
     clamp_px: float = 50.0
     """Fixed soft clamp of remembered losses, pixels. A fixed clamp makes losses of different steps
     comparable; a wide one leaves forgotten rows a gradient."""

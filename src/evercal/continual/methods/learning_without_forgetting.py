@@ -22,6 +22,7 @@ class LearningWithoutForgetting(Method):
     """
 
     citation = "Li and Hoiem, Learning without forgetting, ECCV 2016"
+    weight_field = "weight"
     weight: float = 0.3
     """Weight of each earlier scene's distance."""
     px_per_m: float = PX_PER_M

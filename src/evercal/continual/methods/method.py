@@ -6,8 +6,8 @@ keyframes.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
-from typing import ClassVar
+from dataclasses import fields, is_dataclass, replace
+from typing import ClassVar, Self
 
 from torch import Tensor
 
@@ -70,6 +70,12 @@ class Method:
     """Whether training needs the rows of remembered keyframes."""
     head_per_scene: ClassVar[bool] = False
     """Whether every scene has a head of its own."""
+    weight_field: ClassVar[str] = ""
+    """Field that weights what protects earlier scenes; empty without one."""
+
+    def weighted(self, weight: float) -> Self:
+        """Copy the method with another weight of what protects earlier scenes."""
+        return replace(self, **{self.weight_field: weight})
 
     def select(self, frames: FrameStatistics, capacity: int) -> IntArray | None:
         """Select the keyframes: sorted indices into the recorded frames, or None for no memory."""

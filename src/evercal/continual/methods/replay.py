@@ -3,14 +3,19 @@
 Most methods differ only in the selected frames and the loss of replayed rows; both are fields.
 """
 
-from dataclasses import field
+from dataclasses import field, replace
+from typing import Self
 
 import torch
 from torch import Generator, Tensor
 
 from evercal.classes import frozen
 from evercal.continual.methods.method import Method, StageStart
-from evercal.continual.methods.penalties import Penalty, Reprojection
+from evercal.continual.methods.penalties import (
+    Distillation,
+    Penalty,
+    Reprojection,
+)
 from evercal.continual.networks.buffer import Rows
 from evercal.continual.networks.head import Head, HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
@@ -62,12 +67,19 @@ class Replay(EpisodicMemory):
     """Replays keyframes (Chaudhry et al., On tiny episodic memories, 2019)."""
 
     citation = "Vitter 1985; Chaudhry et al., On tiny episodic memories, 2019"
+    weight_field = "weight"
     penalty: Penalty = field(default_factory=Reprojection)
     """Loss of the replayed rows."""
     weight: float = 1.0
     """Weight of the penalty, the mean over the rows of all remembered scenes."""
     every_scene: bool = False
     """Multiply the weight by the number of remembered scenes; the paper has one for all of them."""
+
+    def weighted(self, weight: float) -> Self:
+        """Copy the method with another weight of its penalty; SPDD is weighted by its scale."""
+        if isinstance(self.penalty, Distillation):
+            return replace(self, penalty=replace(self.penalty, scale=weight))
+        return super().weighted(weight)
 
     def hooks(self, start: StageStart) -> TrainingHooks:
         """Replay from the stage's memories."""
