@@ -58,6 +58,7 @@ FormatName = Literal[
     "generic",
     "7scenes",
     "12scenes",
+    "cambridge",
     "nerfstudio",
     "colmap",
     "wrist",

@@ -169,8 +169,8 @@ class Reading(Named):
     """How the recording is read; options that do not apply to its format are refused."""
 
     format: Name = None
-    """Format of the recording: generic, 7scenes, 12scenes, nerfstudio, colmap, wrist, lerobot or
-    rosbag. Default: recognised from its files."""
+    """Format of the recording: generic, 7scenes, 12scenes, cambridge, nerfstudio, colmap, wrist,
+    lerobot or rosbag. Default: recognised from its files."""
     camera: File = None
     """Intrinsics of all images, if the recording has none: 3x3 matrix as text, JSON, YAML,
     NPZ, ROS camera_info or OpenCV's storage."""
@@ -186,6 +186,9 @@ class Reading(Named):
     metres: bool = False
     """The poses of a COLMAP or nerfstudio recording are in metres. Default: their unit is unknown
     until 'evercal align'."""
+    depth_poses: bool = False
+    """The poses of a 7-Scenes recording are of its depth camera, as published; use those of the
+    colour camera."""
     every: Number = 1
     """Use every N-th image."""
 

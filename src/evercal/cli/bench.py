@@ -33,9 +33,9 @@ class Bench(args.Verb, Training):
 
     suite: Annotated[Positional[str], arg(metavar="SUITE")]
     """One of sim-mini (packaged), sim, sim-7, sim-12, sim-tune, sim-unseen, sim-repeat,
-    real2, i7s, i12s, custom, regions; or a folder of results."""
+    real2, i7s, i12s, custom; or a folder of results."""
     recordings: Annotated[Positional[tuple[Path, ...]], args.shown("[DIR...]")] = ()
-    """Recordings of the suite custom, in order of learning; one recording for regions."""
+    """Recordings of the suite custom, in order of learning."""
     strategies: Annotated[str, arg(metavar="A,B")] = (
         "evercal,joint,finetune,er,sars_spdd"
     )
@@ -50,11 +50,9 @@ class Bench(args.Verb, Training):
     """Comma-separated scenes of the suite. Defaults to all."""
     data: args.Folder = None
     """Folder of the suite's recordings, with one folder per scene."""
-    poses: args.Folder = None
-    """Structure-from-motion poses for i7s and i12s (Brachmann et al., ICCV 2021). Defaults to the
-    original poses."""
-    parts: int = 4
-    """Stages that the suite regions splits a scene into."""
+    poses: Annotated[str, arg(metavar="original|colour|DIR")] = "original"
+    """Poses of i7s and i12s: the original ones, those of the colour camera (i7s), or a folder of
+    poses from structure from motion (Brachmann et al., ICCV 2021)."""
     preset: Preset = field(default="bench", kw_only=True)
     """Training effort per stage; paper needs a GPU."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
@@ -79,7 +77,7 @@ class Bench(args.Verb, Training):
         if self.held_out:
             scenes = list(map(tuning_split, scenes))
             judged = "held-out training frames"
-        poses = "sfm" if self.poses else "original"
+        poses = self.poses if self.poses in ("original", "colour") else "sfm"
         frames = itertools.chain.from_iterable(scene.train for scene in scenes)
         options = BenchOptions(
             self._stage,
@@ -120,20 +118,15 @@ class Bench(args.Verb, Training):
         return tuple(map(strategy_named, dict.fromkeys(names)))
 
     def _recorded(self) -> "list[Recording]":
-        from evercal.continual.benchmark.suites import load_suite, regions
+        from evercal.continual.benchmark.suites import load_suite
         from evercal.recordings import load_recording
 
-        if (self.suite in ("custom", "regions")) != bool(self.recordings):
+        if (self.suite == "custom") != bool(self.recordings):
             raise InputError(
-                f"suite {self.suite}: give scene folders for the suites custom and regions only"
+                f"suite {self.suite}: give scene folders for the suite custom only"
             )
-        scenes = list(map(load_recording, self.recordings))
-        if self.suite == "regions":
-            if len(scenes) > 1:
-                raise InputError(f"suite regions: got {len(scenes)} scenes; give one")
-            return regions(scenes[0], self.parts)
         if self.suite == "custom":
-            return scenes
+            return list(map(load_recording, self.recordings))
         return load_suite(self.suite, self.data, _words(self.scenes), self.poses)
 
     def _stage(self, seed: int) -> "StageOptions":

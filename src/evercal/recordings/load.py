@@ -4,10 +4,12 @@ import importlib
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import NoReturn
 
 from evercal.choices import FormatName
 from evercal.classes import frozen
 from evercal.errors import InputError
+from evercal.recordings.archives import naming_archives
 from evercal.recordings.frame import Recording, with_images
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.frame_names import FrameNames
@@ -38,9 +40,14 @@ class RecordingFormat:
 FORMATS: dict[FormatName, RecordingFormat] = {
     "generic": RecordingFormat("generic", "scene.json"),
     "7scenes": RecordingFormat(
-        "seven_scenes", "TrainSplit.txt, TestSplit.txt and seq-XX folders"
+        "seven_scenes",
+        "TrainSplit.txt, TestSplit.txt and seq-XX folders",
+        ("depth_poses",),
     ),
-    "12scenes": RecordingFormat("twelve_scenes", "info.txt and data"),
+    "12scenes": RecordingFormat("twelve_scenes", "info.txt, split.txt and data"),
+    "cambridge": RecordingFormat(
+        "cambridge", "dataset_train.txt and dataset_test.txt", ("camera",)
+    ),
     "nerfstudio": RecordingFormat("nerfstudio", "transforms.json", ("metres",)),
     "colmap": RecordingFormat(
         "colmap", "sparse/0 with cameras and images", ("metres",)
@@ -117,14 +124,15 @@ def load_recording(
                 f" {', '.join(users)}; leave it out"
             )
     load = FORMATS[format].reader.load
-    recording = load(root, options) if uses else load(root)
-    if options.every > 1:
-        train = recording.train[:: options.every]
-        test = recording.test[:: options.every]
-        recording = replace(recording, train=train, test=test)
-    with named_errors(root, "recording"):
-        folder = root if root.is_dir() else root.parent
-        recording = with_images(recording, folder)
+    with naming_archives(root):
+        recording = load(root, options) if uses else load(root)
+        if options.every > 1:
+            train = recording.train[:: options.every]
+            test = recording.test[:: options.every]
+            recording = replace(recording, train=train, test=test)
+        with named_errors(root, "recording"):
+            folder = root if root.is_dir() else root.parent
+            recording = with_images(recording, folder)
     names = [getattr(options, o) or "" if o not in uses else "" for o in FRAMES]
     frames = recording.frames.completed_by(FrameNames(*names), root)
     recording = replace(recording, frames=frames)
@@ -143,20 +151,27 @@ def format_of(root: Path, stated: FormatName | None = None) -> FormatName:
         raise InputError(
             f"format {stated!r} is not known; use one of {', '.join(FORMATS)}"
         )
-    if not root.exists():
-        raise InputError(f"{root}: no such folder; give the folder of a recorded scene")
-    format = stated or recognised(root)
-    if format is None:
-        what = "a file, not a folder, and no bag"
-        if root.is_dir():
-            what = "no known scene format"
-            inside = [path for path in sorted(root.iterdir()) if recognised(path)]
-            if inside:
-                names = " or ".join(map(str, inside[:4]))
-                raise InputError(f"{root}: no recording, but it has some; give {names}")
-        known = ", ".join(f"{entry.contents} ({key})" for key, entry in FORMATS.items())
-        raise InputError(f"{root}: {what}; expected {known}")
-    return format
+    with naming_archives(root):
+        if not root.exists():
+            raise InputError(
+                f"{root}: no such folder; give the folder of a recorded scene"
+            )
+        return stated or recognised(root) or _refuse(root)
+
+
+def _refuse(root: Path) -> NoReturn:
+    """Say what a file or folder lacks to be a recording."""
+    what = "a file, not a folder, and no bag"
+    if root.is_dir():
+        what = "no known scene format"
+        inside = [path for path in sorted(root.iterdir()) if recognised(path)]
+        names = " or ".join(map(str, inside[:4]))
+        if len(inside) == 1:
+            names += f", or move what it holds to {root}"
+        if inside:
+            raise InputError(f"{root}: no recording, but it has some; give {names}")
+    known = ", ".join(f"{entry.contents} ({key})" for key, entry in FORMATS.items())
+    raise InputError(f"{root}: {what}; expected {known}")
 
 
 vars(load_recording)["check"] = format_of

@@ -77,7 +77,8 @@ def test_frames_of_12_scenes_have_no_sequence(tmp_path: Path) -> None:
             "seq-01/frame-000000.color.png 1 0 0 0 0 nan 0 500",
             "line 1 is not 'image qw",
         ),
-        ("seq-01/frame-000000.color.png 1 0 0 0 0 0 0 -5", "line 1 is not 'image qw"),
+        ("seq-01/frame-000000.color.png 1 0 0 0 0 0 0 -5", "camera fx"),
+        ("seq-01/frame-000000.color.png 0 0 0 0 0 0 0 500", "SE3 got a quaternion of"),
         (f"seq-07/frame-000000.color.png {LINE}", "no frame of heads is in it"),
     ],
 )
@@ -90,3 +91,21 @@ def test_broken_files_are_refused(tmp_path: Path, line: str, message: str) -> No
         InputError, match=r"heads_test\.txt: pose file is missing; get the folder"
     ):
         with_sfm_poses(RECORDING, tmp_path, "heads")
+
+
+def test_another_folder_of_the_repository_is_told_from_the_right_one(
+    tmp_path: Path,
+) -> None:
+    right = tmp_path / "pgt/sfm/7scenes"
+    right.mkdir(parents=True)
+    lines = [f"seq-02/frame-000000.color.png {LINE}"]
+    write(right, lines, [f"seq-01/frame-000000.color.png {LINE}"])
+    other = tmp_path / "pgt/sfm/12scenes"
+    other.mkdir()
+    original = tmp_path / "pgt/dslam/7scenes"
+    original.mkdir(parents=True)
+    write(original, lines, lines)
+    for folder in (tmp_path, tmp_path / "pgt", right.parent, other, original):
+        with pytest.raises(InputError, match=f"motion; give `poses` {right}$"):
+            with_sfm_poses(RECORDING, folder, "heads")
+    assert len(with_sfm_poses(RECORDING, right, "heads").train) == 1

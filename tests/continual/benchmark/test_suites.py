@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evercal.continual.benchmark.suites import SUITES, load_suite, regions, tuning_split
+from evercal.continual.benchmark.suites import SUITES, load_suite, tuning_split
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings import Frame, Recording
@@ -46,8 +46,12 @@ def test_suites_load_their_scenes_in_order() -> None:
             "chess is missing; get it from https://www.micro",
         ),
         (
-            lambda data: load_suite("sim-mini", poses=data),
-            "`poses` are for i7s and i12s",
+            lambda data: load_suite("sim-mini", poses=str(data)),
+            "`poses` .* is for i7s and i12s",
+        ),
+        (
+            lambda data: load_suite("i12s", data, poses="colour"),
+            "suite i12s: `poses` colour is for i7s",
         ),
         (
             lambda data: load_suite("sim", data),
@@ -76,23 +80,3 @@ def test_tuning_split_uses_training_frames_only() -> None:
     assert [int(f.name) for f in scene.train] == [i for i in range(30) if i not in test]
     with pytest.raises(InputError, match=r"hall: 12 of 15 .* omit `held_out`"):
         tuning_split(Recording("hall", train[:16], ()))
-
-
-def test_regions_share_the_base_frame_and_split_every_frame() -> None:
-    # Three positions; the recording starts at the middle one.
-    xs = [5.0] * 20 + [0.0] * 20 + [9.0] * 20
-    train = tuple(frame(f"train-{i}", x + 0.001 * i) for i, x in enumerate(xs))
-    test = tuple(frame(f"test-{x}", x) for x in (0.2, 8.7, 5.1, 0.1))
-    parts = regions(Recording("hall", train, test), 3)
-    assert [scene.name for scene in parts] == ["hall-1", "hall-2", "hall-3"]
-    assert {scene.base for scene in parts} == {"hall"}
-    assert [scene.train for scene in parts] == [train[:20], train[20:40], train[40:]]
-    assert [len(scene.test) for scene in parts] == [1, 2, 1]
-    assert parts[0].test == test[2:3]
-    for count, message in (
-        (1, "`parts` 1"),
-        (4, "are too few"),
-        (61, "too few for `parts` 61"),
-    ):
-        with pytest.raises(InputError, match=message):
-            regions(Recording("hall", train, test), count)

@@ -10,7 +10,6 @@ import pytest
 from evercal.continual.benchmark.suites import load_suite
 from evercal.geometry import SE3, Camera
 from evercal.recordings import load_recording, write_image
-from evercal.recordings.formats import seven_scenes
 
 from ..checks import assert_pose, refused
 
@@ -38,7 +37,7 @@ def kitchen(tmp_path: Path) -> Path:
 
 
 def test_frames_are_in_the_order_of_the_split_files(kitchen: Path) -> None:
-    recording = seven_scenes.load(kitchen)
+    recording = load_recording(kitchen)
     assert recording.name == "kitchen"
     names = [frame.name for frame in (*recording.train, *recording.test)]
     assert names == [f"seq-0{s}/frame-00000{i}" for s in (2, 1, 3) for i in range(3)]
@@ -50,16 +49,16 @@ def test_frames_are_in_the_order_of_the_split_files(kitchen: Path) -> None:
 
 def test_camera_is_the_default_or_that_of_the_intrinsics_file(kitchen: Path) -> None:
     default = Camera(64, 48, 52.5, 52.5, 31.5, 23.5)
-    assert seven_scenes.load(kitchen).train[0].camera == default
+    assert load_recording(kitchen).train[0].camera == default
     (kitchen / "camera-intrinsics.txt").write_text("51 0 30\n0 52 23.5\n0 0 1\n")
     stated = Camera(64, 48, 51.0, 52.0, 30.0, 23.5)
-    assert seven_scenes.load(kitchen).test[0].camera == stated
+    assert load_recording(kitchen).test[0].camera == stated
 
 
 def test_untracked_frames_are_left_out_and_counted(kitchen: Path) -> None:
     write_pose(kitchen / "seq-01/frame-000001.pose.txt", np.full((4, 4), np.inf))
     write_pose(kitchen / "seq-03/frame-000000.pose.txt", np.full((4, 4), np.nan))
-    recording = seven_scenes.load(kitchen)
+    recording = load_recording(kitchen)
     assert recording.untracked == 2
     names = [frame.name for frame in (*recording.train, *recording.test)]
     assert not {"seq-01/frame-000001", "seq-03/frame-000000"} & set(names)
@@ -73,7 +72,7 @@ def test_rotation_with_few_digits_and_jpeg_frames_are_accepted(kitchen: Path) ->
     image = kitchen / "seq-01/frame-000001.color.png"
     write_image(image.with_suffix(".jpg"), np.zeros((48, 64, 3), np.uint8))
     image.unlink()
-    frame = seven_scenes.load(kitchen).train[4]
+    frame = load_recording(kitchen).train[4]
     assert frame.base_from_camera is not None
     rotation = frame.base_from_camera.rotation_matrix()
     np.testing.assert_allclose(rotation, drifted[:3, :3] / 1.001, atol=1e-6)
@@ -164,7 +163,7 @@ SEVEN = [
     ),
     ("seq-0*/*.png", b"no image", r"color\.png: not a readable image"),
     ("seq-02/frame-000000.color.jpg", b"", "'frame-000000' comes twice; keep its"),
-    ("camera-intrinsics.txt", b"525 525", r"camera-intrinsics\.txt: expected a 3x3"),
+    ("camera-intrinsics.txt", b"525 525", r"camera-intrinsics\.txt: .* 9 numbers, got 2"),
     (
         "camera-intrinsics.txt",
         b"0 0 0 0 0 0 0 0 1",

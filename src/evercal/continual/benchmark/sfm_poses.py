@@ -20,11 +20,16 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
+from evercal.recordings.archives import naming_archives
+from evercal.recordings.cameras.camera_file import centred_camera
+from evercal.recordings.formats.cambridge import numbers_by_image
 from evercal.recordings.frame import Recording
-from evercal.storage.text_files import read_text
+from evercal.storage.text_files import named_errors, read_text
 
 _SOURCE = "https://github.com/tsattler/visloc_pseudo_gt_limitations"
 """Repository of the pose files."""
+_LAYOUT = "image qw qx qy qz tx ty tz focal"
+"""A line of a pose file."""
 
 
 def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:
@@ -36,6 +41,7 @@ def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:
     lost = 0
     for split, frames in (("train", recording.train), ("test", recording.test)):
         file = folder / f"{name}_{split}.txt"
+        _require(file)
         poses = _read(file)
         posed = []
         for frame in frames:
@@ -43,15 +49,8 @@ def with_sfm_poses(recording: Recording, folder: Path, name: str) -> Recording:
             if key not in poses:
                 continue
             pose, focal = poses[key]
-            camera = frame.camera
-            camera = replace(
-                camera,
-                fx=focal,
-                fy=focal,
-                # The middle of the image, counted from the centre of the first pixel.
-                cx=(camera.width - 1) / 2,
-                cy=(camera.height - 1) / 2,
-            )
+            with named_errors(file, "pose file"):
+                camera = centred_camera(focal, frame.camera.size)
             posed.append(replace(frame, camera=camera, base_from_camera=pose))
         if frames and not posed:
             first = _key(frames[0].name)
@@ -70,25 +69,27 @@ def _key(name: str) -> str:
     return name.split(".color.")[0].removeprefix("data/")
 
 
+def _require(file: Path) -> None:
+    """In the repository, refuse another folder than that of the poses and name the right one."""
+    folder = file.parent.resolve()
+    is_other = folder.parent.name == "dslam" or not file.is_file()
+    for place in (folder, *folder.parents):
+        for found in place.glob(f"pgt/sfm/*/{file.name}"):
+            if is_other:
+                raise InputError(
+                    f"{folder}: not the poses of structure from motion; give `poses`"
+                    f" {found.parent}"
+                )
+
+
 def _read(file: Path) -> dict[str, tuple[SE3, float]]:
-    text = read_text(file, "pose file", f"get the folder pgt/sfm of {_SOURCE}")
+    """base_from_camera and focal length of each frame."""
+    with naming_archives(file):
+        text = read_text(file, "pose file", f"get the folder pgt/sfm of {_SOURCE}")
+    rows = numbers_by_image(file, text, _LAYOUT)
     poses = {}
-    for number, line in enumerate(filter(str.strip, text.splitlines()), start=1):
-        name, *words = line.split()
-        try:
-            poses[_key(name)] = _pose_and_focal(words)
-        except ValueError:
-            raise InputError(
-                f"{file}: line {number} is not 'image qw qx qy qz tx ty tz focal': {line[:60]!r}"
-            ) from None
+    with named_errors(file, "pose file"):
+        for name, (*pose, focal) in rows.items():
+            camera_from_base = SE3(np.array(pose[:4]), np.array(pose[4:]))
+            poses[_key(name)] = (camera_from_base.inverse(), focal)
     return poses
-
-
-def _pose_and_focal(words: list[str]) -> tuple[SE3, float]:
-    """base_from_camera and focal length of a line; ValueError for other words."""
-    numbers = np.array(list(map(float, words)))
-    if len(numbers) != 8 or not np.isfinite(numbers).all() or numbers[7] <= 0:
-        raise ValueError
-    quaternion = numbers[:4] / np.linalg.norm(numbers[:4])
-    camera_from_base = SE3(quaternion, numbers[4:7])
-    return camera_from_base.inverse(), float(numbers[7])

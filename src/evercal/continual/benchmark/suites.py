@@ -12,14 +12,14 @@ from evercal.continual.benchmark.sfm_poses import with_sfm_poses
 from evercal.errors import InputError
 from evercal.recordings import (
     MIN_TRAIN_FRAMES,
-    Frame,
+    ReadOptions,
     Recording,
     load_recording,
     posed_frames,
-    stated_poses,
 )
+from evercal.recordings.archives import naming_archives
 from evercal.recordings.samples import sample_rooms
-from evercal.typing import Array, Strings
+from evercal.typing import Strings
 
 
 @frozen
@@ -95,18 +95,20 @@ def load_suite(
     name: str,
     data: Path | None = None,
     scenes: Sequence[str] = (),
-    poses: Path | None = None,
+    poses: str = "original",
 ) -> list[Recording]:
     """Load the scenes of a suite in order of learning, by default all.
 
-    `data` has a folder for each scene. `poses` are from structure from motion (Brachmann et al.,
-    ICCV 2021), for i7s and i12s; by default they are the original ones.
+    `data` has a folder for each scene. `poses` are the original ones, for i7s also those of the
+    colour camera, see `ReadOptions.depth_poses`, and for i7s and i12s a folder of poses from
+    structure from motion (Brachmann et al., ICCV 2021).
     """
     if name not in SUITES:
-        names = ", ".join([*SUITES, "custom", "regions"])
+        names = ", ".join([*SUITES, "custom"])
         raise InputError(f"suite {name!r}: unknown; choose one of {names}")
-    if poses and name not in ("i7s", "i12s"):
-        raise InputError(f"suite {name}: `poses` are for i7s and i12s")
+    suites = {"original": (name,), "colour": ("i7s",)}.get(poses, ("i7s", "i12s"))
+    if name not in suites:
+        raise InputError(f"suite {name}: `poses` {poses} is for {' and '.join(suites)}")
     suite = SUITES[name]
     for scene in scenes:
         if scene not in suite.scenes:
@@ -121,18 +123,27 @@ def load_suite(
         raise InputError("this suite needs recordings: give their folder with `data`")
     for scene in names:
         if not (data / scene).is_dir():
-            raise InputError(
-                f"suite {name}: {data / scene} is missing; get it from {suite.source}, or select"
-                " other scenes with `scenes`"
-            )
+            with naming_archives(data / scene):
+                raise InputError(
+                    f"suite {name}: {data / scene} is missing; {_remedy(data, scene, suite)}"
+                )
+    options = ReadOptions(depth_poses=poses == "colour")
     recordings = []
     for scene in names:
         # Names of scenes have no slashes: apt1/kitchen becomes apt1-kitchen.
-        recording = load_recording(data / scene, name=scene.replace("/", "-"))
-        if poses:
-            recording = with_sfm_poses(recording, poses, scene.replace("/", "_"))
+        place = scene.replace("/", "-")
+        recording = load_recording(data / scene, name=place, options=options)
+        if poses not in ("original", "colour"):
+            recording = with_sfm_poses(recording, Path(poses), scene.replace("/", "_"))
         recordings.append(recording)
     return recordings
+
+
+def _remedy(data: Path, scene: str, suite: Suite) -> str:
+    for folder in (data.resolve().parent, *sorted(data.glob("*"))):
+        if (folder / scene).is_dir():
+            return f"give `data` {folder}"
+    return f"get it from {suite.source}, or select other scenes with `scenes`"
 
 
 def tuning_split(scene: Recording) -> Recording:
@@ -151,51 +162,3 @@ def tuning_split(scene: Recording) -> Recording:
             f" {MIN_TRAIN_FRAMES} are needed; omit `held_out`"
         )
     return replace(scene, train=train, test=test)
-
-
-def regions(scene: Recording, parts: int) -> list[Recording]:
-    """Split a scene into a sequence of regions (Bahadir et al., Mach. Vis. Appl. 2024).
-
-    Regions are k-means clusters of the points one metre in front of the training cameras, in the
-    order in which the recording first reaches them. Test frames belong to the nearest cluster. All
-    regions share one base frame, so a pose in a neighbouring region counts.
-    """
-    from scipy.cluster.vq import kmeans2, vq
-
-    if parts < 2:
-        raise InputError(f"`parts` {parts}: give at least 2")
-    train = posed_frames(scene.train)
-    test = posed_frames(scene.test)
-    if len(train) < parts or not test:
-        raise InputError(
-            f"{scene.name}: {len(train)} training and {len(test)} test frames are too few for"
-            f" `parts` {parts}"
-        )
-    rng = np.random.default_rng(0)
-    centres, train_region = kmeans2(_ahead(train), parts, minit="++", rng=rng)
-    test_region, _ = vq(_ahead(test), centres)
-    recordings = []
-    for number, region in enumerate(dict.fromkeys(train_region.tolist()), start=1):
-        region_train = tuple(compress(train, train_region == region))
-        region_test = tuple(compress(test, test_region == region))
-        name = f"{scene.name}-{number}"
-        if len(region_train) < MIN_TRAIN_FRAMES or not region_test:
-            raise InputError(
-                f"{name}: {len(region_train)} training and {len(region_test)} test frames are too"
-                f" few (at least {MIN_TRAIN_FRAMES} and 1); give fewer `parts`"
-            )
-        recordings.append(
-            replace(
-                scene,
-                name=name,
-                train=region_train,
-                test=region_test,
-                base=scene.name,
-            )
-        )
-    return recordings
-
-
-def _ahead(frames: Sequence[Frame]) -> Array:
-    poses = stated_poses(frames)
-    return poses.translation_m + poses.rotation_matrix()[:, :, 2]

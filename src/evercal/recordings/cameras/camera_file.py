@@ -160,7 +160,7 @@ def fields_of(path: Path, size: Size | None = None) -> Fields:
     if all(map(is_number, words)):
         numbers = [*map(float, words)]
         if len(numbers) == 1 and size:
-            numbers = _centred(numbers[0], *size)
+            numbers = centred_camera(numbers[0], size).matrix().ravel().tolist()
         return {"camera_matrix": numbers}
     try:
         if "<opencv_storage" in text:
@@ -175,11 +175,11 @@ def fields_of(path: Path, size: Size | None = None) -> Fields:
     return data
 
 
-def _centred(focal_px: float, width: int, height: int) -> list[float]:
-    """Nine numbers of the intrinsic matrix of a focal length."""
-    cx = (width - 1) / 2
-    cy = (height - 1) / 2
-    return [focal_px, 0.0, cx, 0.0, focal_px, cy, 0.0, 0.0, 1.0]
+def centred_camera(focal_px: float, size: Size) -> Camera:
+    """The camera of a focal length, with the principal point in the middle of the image."""
+    width, height = size
+    centre = ((width - 1) / 2, (height - 1) / 2)
+    return Camera(width, height, focal_px, focal_px, *centre)
 
 
 def _of_xml(text: str) -> JsonObject:

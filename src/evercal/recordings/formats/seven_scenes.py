@@ -13,9 +13,11 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
+from evercal.recordings.cameras.camera_file import centred_camera, read_camera_of_size
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import files_in, first_size
 from evercal.recordings.poses.row_files import is_number
+from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import named_errors, read_text, refuse_repeated
 from evercal.typing import Array
 
@@ -23,6 +25,19 @@ _SPLITS = ("TrainSplit.txt", "TestSplit.txt")
 """Files that list sequences."""
 _FOCAL_AT_640 = 525.0
 """Focal length at 640x480, pixels."""
+COLOUR_FROM_DEPTH = SE3.from_matrix(
+    np.array(
+        [
+            [0.99996518, 0.00267651, -0.00790410, -0.02555894],
+            [-0.00274093, 0.99996303, -0.00815045, 0.00010110],
+            [0.00788199, 0.00817183, 0.99993555, 0.00203183],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+)
+"""Pose of the depth camera in the colour camera of a Kinect of the same model. Measured by LIRIS
+(https://projet.liris.cnrs.fr/voir/activities-dataset/kinect-calibration.html); ACE and GLACE take
+it for 7-Scenes."""
 _ROTATION_TOLERANCE = 1e-2
 """Largest deviation of a pose from a rotation: poses are printed with few digits, or chained in
 float32."""
@@ -36,7 +51,7 @@ def detect(root: Path) -> bool:
     return has_split or any(root.glob("seq-*/"))
 
 
-def load(root: Path) -> Recording:
+def load(root: Path, options: ReadOptions) -> Recording:
     """Read split files and poses, and the size of one image; no other image is opened."""
     train_folders, test_folders = (_sequences(root, name) for name in _SPLITS)
     shared = {*train_folders}.intersection(test_folders)
@@ -52,8 +67,11 @@ def load(root: Path) -> Recording:
             f"{root}: {_SPLITS[0]} and {_SPLITS[1]} are empty; name a sequence in one"
         )
     camera = _camera(root, images)
-    train = tracked_frames(train_images, camera, folders=True)
-    test = tracked_frames(test_images, camera, folders=True)
+    stated_from_camera = SE3.identity()
+    if options.depth_poses:
+        stated_from_camera = COLOUR_FROM_DEPTH.inverse()
+    train = tracked_frames(train_images, camera, stated_from_camera)
+    test = tracked_frames(test_images, camera, stated_from_camera)
     untracked = len(images) - len(train) - len(test)
     return Recording(root.resolve().name, train, test, untracked)
 
@@ -84,16 +102,11 @@ def _sequences(root: Path, split: str) -> list[Path]:
 
 
 def _camera(root: Path, images: Sequence[Path]) -> Camera:
-    width, height = first_size(images)
+    size = first_size(images)
     file = root / "camera-intrinsics.txt"
-    if not file.exists():
-        focal = _FOCAL_AT_640 * max(width, height) / 640.0
-        cx = (width - 1) / 2
-        cy = (height - 1) / 2
-        return Camera(width, height, focal, focal, cx, cy)
-    matrix = read_numbers(file, 9, "3x3 intrinsic").reshape(3, 3)
-    with named_errors(file, "camera"):
-        return Camera.from_matrix(matrix, width, height)
+    if file.exists():
+        return read_camera_of_size(file, size, images[0].name)
+    return centred_camera(_FOCAL_AT_640 * max(size) / 640, size)
 
 
 def colour_images(folder: Path) -> list[Path]:
@@ -115,34 +128,33 @@ def _frame_name(image: str) -> str:
 
 
 def tracked_frames(
-    images: Sequence[Path], camera: Camera, folders: bool = False
+    images: Sequence[Path], camera: Camera, stated_from_camera: SE3 | None = None
 ) -> tuple[Frame, ...]:
     """Build frames from images and the pose files beside them, and drop poses with inf or nan.
 
-    With `folders`, names of frames begin with the name of the folder.
+    With `stated_from_camera`, names of frames begin with the name of the folder.
     """
     frames = []
     for image in images:
         name = _frame_name(image.name)
         file = image.with_name(f"{name}.pose.txt")
-        matrix = read_numbers(file, 16, "4x4 base_from_camera").reshape(4, 4)
+        matrix = _matrix(file)
         if np.isfinite(matrix).all():
             with named_errors(file, "pose"):
                 pose = SE3.from_matrix(matrix, _ROTATION_TOLERANCE)
-            if folders:
+            if stated_from_camera:
                 name = f"{image.parent.name}/{name}"
+                pose @= stated_from_camera
             frames.append(Frame(name, image, camera, pose))
     return tuple(frames)
 
 
-def read_numbers(file: Path, count: int, what: str) -> Array:
-    """Read the `count` numbers of a matrix from a small text file."""
+def _matrix(file: Path) -> Array:
+    """(4, 4) of a small text file."""
     # float() on the words: np.loadtxt takes longer per file than reading the file.
     # Windows prints -1.#INF, 1.#QNAN and -nan(ind).
-    text = re.sub(r"\S*[#(]\S*", "nan", read_text(file, f"{what} matrix"))
-    words = text.split()
-    if len(words) != count or not all(map(is_number, words)):
-        raise InputError(
-            f"{file}: expected a {what} matrix of {count} numbers, got {len(words)}"
-        )
-    return np.array([*map(float, words)])
+    what = "4x4 base_from_camera matrix"
+    words = re.sub(r"\S*[#(]\S*", "nan", read_text(file, what)).split()
+    if len(words) != 16 or not all(map(is_number, words)):
+        raise InputError(f"{file}: expected a {what} of 16 numbers, got {len(words)}")
+    return np.reshape([*map(float, words)], (4, 4))

@@ -18,7 +18,8 @@ from evercal.storage.text_files import library_errors, read_text
 
 def detect(root: Path) -> bool:
     """Whether `root` looks like this format, even if it is damaged."""
-    return (root / "info.txt").is_file() and (root / "data").is_dir()
+    parts = [root / name for name in ("info.txt", "split.txt", "data")]
+    return sum(path.exists() for path in parts) > 1
 
 
 def load(root: Path) -> Recording:
