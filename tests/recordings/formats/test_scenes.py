@@ -163,7 +163,11 @@ SEVEN = [
     ),
     ("seq-0*/*.png", b"no image", r"color\.png: not a readable image"),
     ("seq-02/frame-000000.color.jpg", b"", "'frame-000000' comes twice; keep its"),
-    ("camera-intrinsics.txt", b"525 525", r"camera-intrinsics\.txt: .* 9 numbers, got 2"),
+    (
+        "camera-intrinsics.txt",
+        b"525 525",
+        r"camera-intrinsics\.txt: .* 9 numbers, got 2",
+    ),
     (
         "camera-intrinsics.txt",
         b"0 0 0 0 0 0 0 0 1",
