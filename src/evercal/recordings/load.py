@@ -1,6 +1,8 @@
 """`load_recording`: recognise the format of a recording and read it."""
 
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -9,15 +11,16 @@ from typing import NoReturn
 from evercal.choices import FormatName
 from evercal.classes import frozen
 from evercal.errors import InputError
-from evercal.recordings.archives import naming_archives
 from evercal.recordings.frame import Recording, with_images
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.frame_names import FrameNames
-from evercal.storage.text_files import named_errors
+from evercal.storage.text_files import few, named_errors, natural_key
 from evercal.typing import PathLike, Strings
 
 FRAMES = ("base_frame", "gripper_frame", "camera_frame")
 """Fields of `ReadOptions` that name frames, for all formats that do not choose by them."""
+_ARCHIVES = {".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar"}
+"""Endings of archives."""
 
 
 @frozen
@@ -92,6 +95,31 @@ def recognised(root: Path) -> FormatName | None:
         if entry.reader.detect(root):
             return name
     return None
+
+
+@contextmanager
+def naming_archives(path: Path) -> Iterator[None]:
+    """Name archives at a path in the `InputError` of a recording that cannot be read.
+
+    They are those in the folder, that of a missing folder, or the path itself. An archive beside a
+    file or folder of its name is unpacked.
+    """
+    try:
+        yield
+    except InputError as error:
+        folder = next(place for place in (path, *path.parents) if place.is_dir())
+        archives = []
+        for file in folder.glob("*"):
+            content = folder / file.name.partition(".")[0]
+            if file.suffix.lower() not in _ARCHIVES or content.exists():
+                continue
+            if folder == path or path in (file, content) or content in path.parents:
+                archives.append(file.name)
+        if not archives:
+            raise
+        names = few(sorted(archives, key=natural_key))
+        text = f"{error}; not unpacked: {names}; unpack in {folder}"
+        raise InputError(text) from None
 
 
 def load_recording(

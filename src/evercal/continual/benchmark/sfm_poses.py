@@ -20,10 +20,10 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3
-from evercal.recordings.archives import naming_archives
 from evercal.recordings.cameras.camera_file import centred_camera
 from evercal.recordings.formats.cambridge import numbers_by_image
 from evercal.recordings.frame import Recording
+from evercal.recordings.load import naming_archives
 from evercal.storage.text_files import named_errors, read_text
 
 _SOURCE = "https://github.com/tsattler/visloc_pseudo_gt_limitations"

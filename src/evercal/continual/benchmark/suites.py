@@ -17,7 +17,7 @@ from evercal.recordings import (
     load_recording,
     posed_frames,
 )
-from evercal.recordings.archives import naming_archives
+from evercal.recordings.load import naming_archives
 from evercal.recordings.samples import sample_rooms
 from evercal.typing import Strings
 
