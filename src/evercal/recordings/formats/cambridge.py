@@ -42,12 +42,12 @@ _FARTHEST_M = 1e4
 
 def detect(root: Path) -> bool:
     """Whether `root` holds one of the lists."""
-    return any((root / name).is_file() for name in _LISTS)
+    return any(map(Path.is_file, map(root.joinpath, _LISTS)))
 
 
 def load(root: Path, options: ReadOptions) -> Recording:
     """Read the lists, focal lengths, and the size of one image; no other image is opened."""
-    lists = [_poses(root / name) for name in _LISTS]
+    lists = list(map(_poses, map(root.joinpath, _LISTS)))
     names = [*lists[0], *lists[1]]
     if not names:
         raise InputError(f"{root}: {' and '.join(_LISTS)} name no image")
@@ -60,8 +60,9 @@ def load(root: Path, options: ReadOptions) -> Recording:
             if camera and np.abs(pose.translation_m).max() < _FARTHEST_M:
                 frames.append(Frame(name, root / name, camera, pose))
         splits.append(tuple(frames))
-    lost = len(names) - len(splits[0]) - len(splits[1])
-    return Recording(root.resolve().name, *splits, lost)
+    train, test = splits
+    lost = len(names) - len(train) - len(test)
+    return Recording(root.resolve().name, train, test, lost)
 
 
 def numbers_by_image(file: Path, text: str, layout: str) -> dict[str, list[float]]:
@@ -69,7 +70,7 @@ def numbers_by_image(file: Path, text: str, layout: str) -> dict[str, list[float
     rows = {}
     for number, line in enumerate(filter(str.strip, text.splitlines()), start=1):
         name, *words = line.split()
-        numbers = [float(word) for word in words if is_number(word)]
+        numbers = list(map(float, filter(is_number, words)))
         if len(numbers) != len(layout.split()) - 1 or not np.isfinite(numbers).all():
             raise InputError(f"{file}: line {number} is not {layout!r}: {line[:60]!r}")
         rows[name] = numbers
@@ -91,7 +92,7 @@ def _poses(file: Path) -> dict[str, SE3]:
 
 def _cameras(root: Path, names: list[str], file: Path | None) -> dict[str, Camera]:
     """The camera of each image by `_stem`, from a file for all or from the reconstruction."""
-    size = first_size([root / name for name in names])
+    size = first_size(list(map(root.joinpath, names)))
     if file:
         camera = read_camera_of_size(file, size, names[0])
         return dict.fromkeys(map(_stem, names), camera)

@@ -18,8 +18,8 @@ from evercal.storage.text_files import library_errors, read_text
 
 def detect(root: Path) -> bool:
     """Whether `root` looks like this format, even if it is damaged."""
-    parts = [root / name for name in ("info.txt", "split.txt", "data")]
-    return sum(path.exists() for path in parts) > 1
+    parts = map(root.joinpath, ("info.txt", "split.txt", "data"))
+    return sum(map(Path.exists, parts)) > 1
 
 
 def load(root: Path) -> Recording:
