@@ -3,23 +3,39 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 
 from evercal.continual.benchmark import results
 from evercal.continual.benchmark.comparison import (
     AREA,
     FINAL,
+    NEWEST,
+    TFR,
     complete_runs,
     contrast_table,
     method_table,
     run_scores,
     seeds_interval,
+    thresholds,
 )
 from evercal.continual.benchmark.figures import COLOURS, new_figure, tidy
 from evercal.continual.benchmark.results import Table
+from evercal.storage.settings import read_settings
 
 FOLDER = Path(__file__).resolve().parent.parent / "results"
+
+
+_SHOWN = (FINAL, NEWEST, TFR, AREA, "memory MB")
+"""Columns of `run_scores` that pages have, the first three at either threshold."""
+FILLED = (
+    "er",
+    "sars_reprojection",
+    "reservoir_spdd",
+    "sars_spdd",
+    "sars_spdd_filled",
+)
+"""Strategies whose memory is varied."""
 
 
 def summary(name: str, single: bool = False) -> Callable[[], Table]:
@@ -29,28 +45,43 @@ def summary(name: str, single: bool = False) -> Callable[[], Table]:
         name: Folder of `evercal bench`.
         single: Strategies with one run, instead of those with several.
     """
-    columns = ["1 cm 1 deg %", AREA, "last scene %", "TFR", "memory MB", "s"]
 
     def table() -> Table:
         rows = _bench(name)
-        names = rows["strategy"].unique()
-        lines = method_table(run_scores(rows)).loc[names]
+        lines = _methods(name)
+        names = lines.index
         # Seconds are means over the runs of one machine, the one with most runs.
         places = rows.groupby(["strategy", "seed"], sort=False)["environment"].first()
         common = rows[rows["environment"] == places.mode(dropna=False).iloc[0]]
-        if len(common):
-            lines["s"] = (
-                method_table(run_scores(common))["s"].reindex(names).fillna("-")
-            )
-        lines = lines[(lines["runs"] == 1) == single]
-        return lines[["runs", FINAL, *columns]].reset_index()
+        if not len(common):  # environments were not recorded
+            common = rows
+        seconds = method_table(run_scores(common))["s"]
+        lines["s"] = seconds.reindex(names).fillna("-")
+        return lines[(lines["runs"] == 1) == single].reset_index()
 
     return table
+
+
+def _methods(name: str) -> Table:
+    """The shown columns of `method_table`, a row per strategy in the order of the runs."""
+    rows = _bench(name)
+    scores = _scores(name)
+    shown = [title for title in scores if title.split(",")[0] in _SHOWN]
+    return method_table(scores).loc[rows["strategy"].unique(), ["runs", *shown]]
 
 
 def _bench(name: str) -> Table:
     rows = complete_runs(results.read(FOLDER / name))
     return rows[~rows["strategy"].str.contains(":")]
+
+
+def _scores(name: str) -> Table:
+    """Scores of all runs, those of the suite's threshold first."""
+    return run_scores(_bench(name), _suite(name))
+
+
+def _suite(name: str) -> str:
+    return str(read_settings(FOLDER / name / results.SETTINGS)["suite"])
 
 
 def contrasts() -> Table:
@@ -63,13 +94,15 @@ def contrasts() -> Table:
         "buff_cs",
     )
     pairs = [("sars_spdd", other) for other in others]
-    return contrast_table(run_scores(_bench("networks-a")), pairs).reset_index()
+    return contrast_table(_scores("networks-a"), pairs)
 
 
 def environments() -> Table:
     """Where the runs were measured: a row per commit and machine."""
     rows = results.read(FOLDER / "networks-a").drop_duplicates(["strategy", "seed"])
-    table = pd.DataFrame(results.read_environments(FOLDER / "networks-a")).T
+    table = pd.DataFrame(
+        results.read_records(FOLDER / "networks-a" / results.ENVIRONMENTS)
+    ).T
     table["runs"] = rows.groupby("environment").size()
     return table[
         ["commit", "processor", "gpu", "precision", "torch", "threads", "runs"]
@@ -78,72 +111,55 @@ def environments() -> Table:
 
 def memory() -> Table:
     """The same scenes with several shares of keyframes, means over runs."""
-    wanted = (
-        "er",
-        "sars_reprojection",
-        "reservoir_spdd",
-        "sars_spdd",
-        "sars_spdd_filled",
-    )
-    bounds = {
-        "5 cm/5 deg": "within_5cm_5deg",
-        "1 cm/1 deg": "within_1cm_1deg",
-        "5 mm/0.5 deg": "within_5mm_05deg",
-    }
-    table = []
+    tables = []
     for share in (1, 3, 30):
-        folder = FOLDER / f"networks-memory-{share}"
-        rows = _bench(folder.name)
-        frames = results.read_frames(folder)
-        last = rows[rows["stage"] == rows["stage"].max()]
-        for name in rows["strategy"].unique():
-            if name not in wanted:
-                continue
-            ends = last[last["strategy"] == name]
-            cells = {"keyframes": f"{share} %", "strategy": name}
-            for title, within in bounds.items():
-                cells[title] = f"{(100 * ends[within] / ends['frames']).mean():.1f}"
-            median = frames.loc[frames["strategy"] == name, "error_mm"].median()
-            wrong = ends["wrong_scene"].sum() / ends["seed"].nunique()
-            cells["median mm"] = f"{median:.1f}" if np.isfinite(median) else "-"
-            size = (ends["memory_bytes"] + ends["head_bytes"]).iloc[0] / 1e6
-            table.append(cells | {"wrong scene": f"{wrong:.0f}", "MB": f"{size:.1f}"})
-    return pd.DataFrame(table)
+        lines = _methods(f"networks-memory-{share}").reset_index()
+        lines.insert(0, "keyframes", f"{share} %")
+        tables.append(lines[lines["strategy"].isin(FILLED)])
+    return pd.concat(tables)
 
 
 def draw(name: str, path: Path) -> None:
-    """Draw final accuracy over forgetting, a point per strategy, with intervals over seeds."""
-    scores = run_scores(_bench(name)).fillna(0.0)  # joint training has no stages
-    grouped = (
-        scores.groupby("strategy")
-        .filter(lambda runs: len(runs) > 1)
-        .groupby("strategy")
+    """Draw final accuracy over forgetting, a point per strategy, with intervals over seeds.
+
+    The threshold of the suite is on the left, the other one on the right.
+    """
+    scores = _scores(name).fillna(0.0)  # joint training has no stages
+    several = scores.groupby("strategy").filter(lambda runs: len(runs) > 1)
+    limits = thresholds(_suite(name))
+    suffixes = ("", f", {limits[1].length}")
+    figure = new_figure(9.6, 4.4)
+    panels = figure.subplots(1, 2, sharey=True)
+    for panel, limit, suffix in zip(panels, limits, suffixes, strict=True):
+        _scatter(panel, several, suffix)
+        panel.set_title(limit.text, fontsize=9)
+        panel.set_xlabel("total forgetting rate (points)")
+        panel.set_ylim(0, 103)
+        panel.set_xlim(-3, 103)
+        tidy(panel)
+    panels[0].set_ylabel("final accuracy (%)")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside right center", frameon=False, fontsize=8
     )
-    order = grouped[FINAL].mean().sort_values(ascending=False).index
-    figure = new_figure(7.2, 4.4)
-    panel = figure.subplots()
-    for number, strategy in enumerate(order):
-        final, forgetting = (grouped.get_group(strategy)[key] for key in (FINAL, "TFR"))
-        x = forgetting.mean()
-        y = final.mean()
+    figure.savefig(path)
+
+
+def _scatter(panel: Axes, scores: Table, suffix: str) -> None:
+    """Draw the points at one threshold, the columns of which end in `suffix`."""
+    for number, strategy in enumerate(scores.index.unique("strategy")):
+        runs = scores.loc[strategy]
+        final = runs[f"{FINAL}{suffix}"]
+        forgetting = runs[f"{TFR}{suffix}"]
         panel.errorbar(
-            x,
-            y,
-            xerr=x - seeds_interval(forgetting)[0],
-            yerr=y - seeds_interval(final)[0],
+            forgetting.mean(),
+            final.mean(),
+            xerr=forgetting.mean() - seeds_interval(forgetting)[0],
+            yerr=final.mean() - seeds_interval(final)[0],
             fmt="osD^v<>PXph*"[number % 12],
             color=COLOURS[number % len(COLOURS)],
             # Colours repeat; the second time the markers are open.
             markerfacecolor="white" if number >= len(COLOURS) else None,
             elinewidth=0.7,
-            label=f"{strategy}  {y:.0f}",
+            label=strategy,
         )
-    panel.legend(
-        loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8
-    )
-    panel.set_xlabel("total forgetting rate (points)")
-    panel.set_ylabel("final accuracy, 5 cm and 5 deg (%)")
-    panel.set_ylim(0, 103)
-    panel.set_xlim(-3, 103)
-    tidy(panel)
-    figure.savefig(path)

@@ -91,17 +91,19 @@ class Bench(args.Verb, Training):
         with Bars(self.log) as bars:
             options = dataclasses.replace(options, on_event=observer(bars))
             for step in run_bench(scenes, options, self.out):
-                bars.write(_progress(step))
+                bars.write(_progress(step, self.suite))
         return self._show(self.out, strategies[0].name)
 
     def _show(self, folder: Path, reference: str = "") -> int:
-        """Write tables and figure of a folder of results, and print the tables."""
-        from evercal.continual.benchmark import report, results
-        from evercal.continual.benchmark.comparison import LEGEND, summary
+        """Write tables and figures of a folder of results, and print the tables."""
+        from evercal.continual.benchmark import report
+        from evercal.continual.benchmark.comparison import LEGEND
 
-        text = report.write_report(folder, reference or _words(self.strategies)[0])
-        wrote = f"wrote {folder / report.TABLES}, {report.LATEX}, {report.FIGURE}"
-        record = {"strategies": summary(results.read(folder))}
+        text, summary = report.write_report(
+            folder, reference or _words(self.strategies)[0]
+        )
+        wrote = f"wrote {folder / report.TABLES}, {report.LATEX} and figures"
+        record = {"strategies": summary}
         self.answer(record, f"{text}\n\n{LEGEND}", wrote, then=("bench", folder))
         return 0
 
@@ -138,20 +140,19 @@ class Bench(args.Verb, Training):
         return given.stage(seed, self.memory, "fixed")
 
 
-def _progress(step: "CompletedStage") -> str:
-    """Describe a stage: accuracy of each scene, under every name that the strategy is judged by."""
-    start = f"[{step.done}/{step.total}]"
-    seed = f"seed {step.seed}"
+def _progress(step: "CompletedStage", suite: str) -> str:
+    """Describe a stage: accuracy of each scene."""
+    from evercal.continual.benchmark.comparison import thresholds
+
+    run = f"[{step.done}/{step.total}] {step.strategy} seed {step.seed}"
     rows = step.results
     if rows.empty:
-        return f"{start} {step.strategy} {seed}: no results before the last stage"
-    shares = 100 * rows["within_5cm_5deg"] / rows["frames"]
-    scenes = rows["scene"] + shares.map(" {:.1f}".format)
-    groups = scenes.groupby(rows["strategy"], sort=False)
-    strategies = [f"{name} {seed}: {', '.join(group)}" for name, group in groups]
+        return f"{run}: no results before the last stage"
+    threshold, _ = thresholds(suite)
+    shares = 100 * rows[threshold.column] / rows["frames"]
+    scenes = ", ".join(rows["scene"] + shares.map(" {:.1f}".format))
     seconds = rows["seconds"].iloc[0]
-    text = "; ".join(strategies)
-    return f"{start} {text} % within 5 cm, 5 deg ({seconds:.0f} s)"
+    return f"{run}: {scenes} % at {threshold.text} ({seconds:.0f} s)"
 
 
 def _words(text: str) -> tuple[str, ...]:

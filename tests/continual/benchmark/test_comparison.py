@@ -9,23 +9,29 @@ import pytest
 from evercal.continual.benchmark.comparison import (
     AREA,
     FINAL,
+    NEWEST,
+    TFR,
     complete_runs,
     continual,
     contrast_table,
+    gate,
     matrix,
     method_table,
     run_scores,
     scene_table,
     seeds_interval,
     summary,
+    thresholds,
 )
 from evercal.errors import InputError
 
 from .results_by_hand import JOINT, OURS, THEIRS, table
 
+COARSE, _ = thresholds("i7s")
+
 
 def test_accuracy_matrix_and_its_scores() -> None:
-    accuracies = matrix(OURS[OURS["seed"] == 0])
+    accuracies = matrix(OURS[OURS["seed"] == 0], COARSE)
     assert list(accuracies.columns) == ["b", "a"]
     np.testing.assert_allclose(accuracies.to_numpy()[np.tril_indices(2)], [80, 70, 60])
     assert math.isnan(accuracies.iloc[0, 1])  # pyright: ignore[reportArgumentType]
@@ -55,8 +61,8 @@ def test_method_table_shows_means_and_spread() -> None:
     # Finals 65 and 70; last scene 60 and 50; forgetting 10 and 0;
     # ACC (80 + 70 + 60) / 3 and (90 + 90 + 50) / 3.
     ours = methods.loc["ours"]
-    assert ours[["runs", FINAL, "1 cm 1 deg %"]].tolist() == [2, "67.5 ± 3.5", "0.0"]
-    assert ours[["ACC", "last scene %", "TFR"]].tolist() == ["73.3", "55.0", "5.0"]
+    assert ours[["runs", FINAL]].tolist() == [2, "67.5 ± 3.5"]
+    assert ours[["ACC", NEWEST, TFR]].tolist() == ["73.3", "55.0", "5.0"]
     # A frame off by 2 cm has 90 % of the area to 20 cm, other frames nothing.
     assert float(ours[AREA]) == pytest.approx(0.9 * 67.5, abs=0.06)
     # One of 20 frames is in the wrong scene, none has a covariance.
@@ -74,6 +80,34 @@ def test_method_table_shows_means_and_spread() -> None:
     assert methods.loc["theirs", FINAL] == "45.0"
 
 
+def test_scores_are_at_the_threshold_of_the_suite_and_the_other_is_beside() -> None:
+    """Frames are off by 2 cm or more, but for 12 of the first scene and 6 of both at the end."""
+    run = OURS[OURS["seed"] == 0].assign(within_1cm_1deg=[12, 6, 6])
+    simulated = run_scores(run, "sim-unseen").iloc[0]
+    real = run_scores(run, "i7s").iloc[0]
+    judged = [FINAL, NEWEST, TFR]
+    assert simulated[judged].tolist() == pytest.approx([30, 30, 30])
+    assert real[judged].tolist() == pytest.approx([65, 60, 10])
+    assert simulated[[f"{name}, 5 cm" for name in judged]].tolist() == [*real[judged]]
+    assert real[[f"{name}, 1 cm" for name in judged]].tolist() == [*simulated[judged]]
+    assert simulated["BWT"] == pytest.approx(-30)
+    assert simulated["ACC"] == pytest.approx(40)
+    assert simulated[AREA] == real[AREA]
+    assert scene_table(run, "sim").loc["ours", "b"] == "60.0 -> 30.0"
+    assert summary(run, "sim")["ours"][0]["total_forgetting"] == pytest.approx(30)
+    contrasts = contrast_table(run_scores(run, "sim"), [("ours", "theirs")])
+    assert contrasts["score"].tolist() == [FINAL, f"{FINAL}, 5 cm", AREA]
+
+
+def test_the_gate_is_joint_training_at_the_threshold_of_the_suite() -> None:
+    joint = JOINT.assign(within_5cm_5deg=19, within_1cm_1deg=4)
+    assert "not run" in gate(run_scores(OURS), "")
+    passed = gate(run_scores(joint, "i7s"), "i7s")
+    assert "95.0 % at 5 cm and 5 deg, the budget suffices" in passed
+    failed = gate(run_scores(joint, "sim"), "sim")
+    assert "20.0 % at 1 cm and 1 deg, below 95 %" in failed
+
+
 def test_scene_table_shows_accuracy_when_learned_and_at_the_end() -> None:
     # b: (80 + 90) / 2 -> (70 + 90) / 2
     cells = scene_table(OURS).loc["ours"]
@@ -87,11 +121,12 @@ def test_contrasts_pair_seeds_and_name_missing_runs() -> None:
         run_scores(results), [("ours", "theirs"), ("ours", "joint")]
     )
     half = 25.452 * 2.5
-    bounds = f"{17.5 - half:+.1f} to {17.5 + half:+.1f}"
-    row = contrasts.loc["ours - theirs"].tolist()
-    assert row[:4] == [2, "+17.5", bounds, 2]
-    assert float(row[4]) == pytest.approx(0.9 * 17.5, abs=0.06)
-    assert contrasts.loc["ours - joint"].tolist() == [0, *["-"] * 6]
+    ends = [f"{17.5 - half:+.1f}", f"{17.5 + half:+.1f}"]
+    rows = contrasts.set_index(["score", "contrast"])
+    assert rows.loc[(FINAL, "ours - theirs")].tolist() == [2, "+17.5", *ends, 2]
+    area = rows.loc[(AREA, "ours - theirs"), "points"]
+    assert float(area) == pytest.approx(0.9 * 17.5, abs=0.06)
+    assert rows.loc[(FINAL, "ours - joint")].tolist() == [0, "-", "-", "-", 0]
 
 
 def test_seeds_interval_is_students() -> None:

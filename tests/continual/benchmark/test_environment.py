@@ -21,7 +21,10 @@ def test_records_of_several_machines_are_kept(
     other = {**record, "processor": "another"}
     monkeypatch.setattr(results, "environment", lambda: other)
     second = results.record_environment(tmp_path)
-    assert results.read_environments(tmp_path) == {first: record, second: other}
+    assert results.read_records(tmp_path / results.ENVIRONMENTS) == {
+        first: record,
+        second: other,
+    }
 
 
 def test_without_a_checkout_the_version_is_recorded(

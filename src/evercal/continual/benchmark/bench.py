@@ -4,6 +4,7 @@
     OUT/environments.json         commit, versions and processor of the runs
     OUT/strategies.json           description of each strategy: method, hyper-parameters, map
     OUT/results.csv, frames.csv   see `benchmark.results`
+    OUT/overlays/                 pictures, see `benchmark.overlays`
     OUT/features/                 encoded views, shared by all runs; may be deleted
     OUT/runs/STRATEGY-SEED/       store of a run in progress, removed when the run is complete
     OUT/runs/first-SCENE-SEED/    the first scene, shared by all networks
@@ -125,9 +126,7 @@ def begin_bench(
 
 def _is_complete(stored: Table, strategy: Strategy, seed: int, scenes: int) -> bool:
     rows = results.run_of(stored, strategy.name, seed)
-    is_last = rows["stage"] == scenes - 1
-    evaluated = is_last.groupby(rows["strategy"]).sum()
-    return len(rows) > 0 and bool((evaluated == scenes).all())
+    return bool((rows["stage"] == scenes - 1).sum() == scenes)
 
 
 def _record_strategies(out: Path, strategies: Sequence[Strategy]) -> None:

@@ -6,30 +6,58 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pandas as pd
 
+from evercal.classes import frozen
 from evercal.continual.benchmark.results import Table
 from evercal.errors import InputError
 from evercal.evaluation.metrics import ContinualScores, continual_scores
 from evercal.typing import JsonObject, Pair
 
-COARSE_COLUMN = "within_5cm_5deg"
-"""Column of results.csv that counts frames within 5 cm and 5 deg."""
-FINE_COLUMN = "within_1cm_1deg"
-"""Column of results.csv that counts frames within 1 cm and 1 deg."""
 FINAL = "final %"
 """Column of `run_scores`: accuracy after the last stage."""
+NEWEST = "newest %"
+"""Column of `run_scores`: accuracy on the scene learned last."""
+TFR = "TFR"
+"""Column of `run_scores`: total forgetting rate."""
 AREA = "area to 20 cm"
 """Column of `run_scores`: area under the curve of recall over position error."""
+GATE = 95.0
+"""Accuracy of joint training, per cent, below which a budget is too small for a verdict."""
 LEGEND = """\
-Accuracy: share of all test frames strictly below 5 cm and 5 deg, mean over scenes.
-final: accuracy after the last stage. last scene: accuracy on the scene learned last.
+Accuracy: share of all test frames with both errors strictly below the threshold, mean over scenes.
+The threshold is 1 cm and 1 deg for suites sim*, 5 cm and 5 deg for others, as in the paper. Columns
+that end in a length are at the other threshold.
+final: accuracy after the last stage. newest: accuracy on the scene learned last.
 area to 20 cm: area under the curve of recall over position error, up to 20 cm, per cent.
 ACC: mean accuracy over all stages and the scenes learned by then.
 TFR (total forgetting rate): mean drop from the best accuracy of a scene to its final one.
 forgetting: the same drop, with the best taken before the last stage; negative is a gain.
 BWT (backward transfer): mean change from the accuracy just after learning a scene to the end.
-s: seconds of learning, all stages.
-NAME:unaligned is the pose from matched keyframes, before landmarks are aligned."""
-"""Definitions of the columns of `run_scores`."""
+published: the paper's numbers; for suites sim* those of its Sim data set, whose rooms are others.
+s: seconds of learning, all stages."""
+"""Definitions of the columns of the tables."""
+
+
+@frozen
+class Threshold:
+    """Errors strictly below which a pose is correct."""
+
+    length: str
+    """The length alone, the suffix of columns."""
+    text: str
+    """Both errors."""
+    column: str
+    """Column of results.csv that counts correct frames."""
+
+
+_COARSE = Threshold("5 cm", "5 cm and 5 deg", "within_5cm_5deg")
+_FINE = Threshold("1 cm", "1 cm and 1 deg", "within_1cm_1deg")
+
+
+def thresholds(suite: str) -> tuple[Threshold, Threshold]:
+    """Return the threshold of a suite as in the paper, and the other one."""
+    if suite.startswith("sim"):
+        return _FINE, _COARSE
+    return _COARSE, _FINE
 
 
 def complete_runs(results: Table) -> Table:
@@ -43,12 +71,14 @@ def complete_runs(results: Table) -> Table:
     return complete
 
 
-def run_scores(results: Table) -> Table:
+def run_scores(results: Table, suite: str = "") -> Table:
     """Score every complete run: a row per strategy and seed, with the columns of `LEGEND`.
 
     Forgetting and memory of joint training are NaN.
     """
-    scores = {(name, seed): _scores(run) for name, seed, run in _runs(results)}
+    scores = {}
+    for name, seed, run in _runs(results):
+        scores[name, seed] = _scores(run, suite)
     table = pd.DataFrame.from_dict(scores, orient="index")
     return table.rename_axis(["strategy", "seed"])
 
@@ -65,26 +95,29 @@ def last_stage(results: Table) -> Table:
     return results[results["stage"] == results["stage"].max()]
 
 
-def _scores(run: Table) -> dict[str, float]:
-    coarse = continual(matrix(run))
-    fine = continual(matrix(run, FINE_COLUMN))
+def _scores(run: Table, suite: str) -> dict[str, float]:
     last = last_stage(run)
     inside = math.nan
     with_covariance = last["with_covariance"].sum()
     if with_covariance:
         inside = 100 * last["inside_95"].sum() / with_covariance
+    threshold, other = thresholds(suite)
+    judged = continual(matrix(run, threshold))
+    beside = continual(matrix(run, other))
     memory_mb = last["memory_bytes"].iloc[0] / 1e6
-    if math.isnan(coarse.total_forgetting):  # joint training needs all frames again
+    if math.isnan(judged.total_forgetting):  # joint training needs all frames again
         memory_mb = math.nan
     return {
-        FINAL: coarse.final_accuracy,
-        "1 cm 1 deg %": fine.final_accuracy,
+        FINAL: judged.final_accuracy,
+        NEWEST: judged.last_scene_accuracy,
+        TFR: judged.total_forgetting,
+        f"{FINAL}, {other.length}": beside.final_accuracy,
+        f"{NEWEST}, {other.length}": beside.last_scene_accuracy,
+        f"{TFR}, {other.length}": beside.total_forgetting,
         AREA: float(last["area_20cm"].mean()),
-        "ACC": coarse.accuracy_along,
-        "last scene %": coarse.last_scene_accuracy,
-        "TFR": coarse.total_forgetting,
-        "forgetting": coarse.forgetting,
-        "BWT": coarse.backward_transfer,
+        "ACC": judged.accuracy_along,
+        "forgetting": judged.forgetting,
+        "BWT": judged.backward_transfer,
         "wrong scene %": 100 * float((last["wrong_scene"] / last["frames"]).mean()),
         "refused %": 100 * float((last["refused"] / last["frames"]).mean()),
         "in 95 % ellipsoid": inside,
@@ -99,13 +132,10 @@ def _seconds(run: Table) -> float:
     return float(run.groupby("stage")["seconds"].last().sum())
 
 
-def matrix(run: Table, column: str = COARSE_COLUMN) -> Table:
-    """Return accuracies of a run, per cent: a row per stage, a column per scene as learned.
-
-    `column` is one of `WITHIN`.
-    """
+def matrix(run: Table, threshold: Threshold) -> Table:
+    """Return accuracies of a run, per cent: a row per stage, a column per scene as learned."""
     scenes = list(last_stage(run)["scene"])
-    percent = 100 * run[column] / run["frames"]
+    percent = 100 * run[threshold.column] / run["frames"]
     shares = run.assign(share=percent)
     accuracies = shares.pivot_table(index="stage", columns="scene", values="share")
     return accuracies.reindex(index=range(len(scenes)), columns=scenes)
@@ -129,21 +159,26 @@ def method_table(scores: Table) -> Table:
     """
     grouped = scores.groupby(level="strategy", sort=False)
     means = grouped.mean().where(grouped.count().eq(grouped.size(), axis=0))
-    runs = grouped.size()
-    spread = grouped[FINAL].std()
     table = formatted(means)
-    several = table[FINAL] + " ± " + formatted(spread)
-    table[FINAL] = table[FINAL].where(spread.isna(), several)
-    table.insert(0, "runs", runs)
+    for name in finals(scores):
+        spread = grouped[name].std()
+        several = table[name] + " ± " + formatted(spread)
+        table[name] = table[name].where(spread.isna(), several)
+    table.insert(0, "runs", grouped.size())
     best_first = means[FINAL].sort_values(ascending=False, kind="stable")
     return table.loc[best_first.index]
 
 
-def scene_table(results: Table) -> Table:
+def finals(scores: Table) -> list[str]:
+    """Return the columns of final accuracies, that of the suite's threshold first."""
+    return [name for name in scores if name.startswith(FINAL)]
+
+
+def scene_table(results: Table, suite: str = "") -> Table:
     """Tabulate the accuracy of each scene: just after learning it -> at the end, means of runs."""
     runs = []
     for name, _, run in _runs(results):
-        accuracies = matrix(run)
+        accuracies = matrix(run, thresholds(suite)[0])
         columns = {
             "strategy": name,
             "scene": accuracies.columns,
@@ -159,36 +194,48 @@ def scene_table(results: Table) -> Table:
 def contrast_table(scores: Table, pairs: Sequence[tuple[str, str]]) -> Table:
     """Tabulate differences of pairs of strategies on common seeds, in points; see `run_scores`.
 
-    Final accuracy and area, each with the bounds of `seeds_interval`, which hold for all pairs
+    Final accuracies and area, each with the ends of `seeds_interval`, which hold for all pairs
     together, and the number of runs in which the first strategy is better.
     """
-    by_name = dict(list(scores[[FINAL, AREA]].groupby(level="strategy")))
-    none = scores[:0][[FINAL, AREA]]
-    rows = {}
-    for ours, theirs in pairs:
-        first = by_name.get(ours, none).droplevel("strategy")
-        second = by_name.get(theirs, none).droplevel("strategy")
-        gains = (first - second).dropna()
-        cells: list[object] = [len(gains)]
-        for name in (FINAL, AREA):
-            cells += _contrast_cells(gains[name], len(pairs))
-        rows[f"{ours} - {theirs}"] = cells
-    columns = ["runs"]
-    for name in (FINAL, AREA):
-        columns += [name, "bounds", "better in"]
-    index = pd.Index(rows, name="contrast, points")
-    return pd.DataFrame(list(rows.values()), index, columns=columns)
+    columns = [*finals(scores), AREA]
+    by_name = dict(list(scores[columns].groupby(level="strategy")))
+    none = scores[:0][columns]
+    rows = []
+    for score in columns:
+        for ours, theirs in pairs:
+            first = by_name.get(ours, none).droplevel("strategy")
+            second = by_name.get(theirs, none).droplevel("strategy")
+            gains = (first - second)[score].dropna()
+            low, high = seeds_interval(gains, len(pairs))
+            rows.append(
+                {
+                    "score": score,
+                    "contrast": f"{ours} - {theirs}",
+                    "runs": len(gains),
+                    "points": gains.mean(),
+                    "low": low,
+                    "high": high,
+                    "better in": (gains > 0).sum(),
+                }
+            )
+    table = pd.DataFrame(rows)
+    if rows:
+        signed = ["points", "low", "high"]
+        table[signed] = formatted(table[signed], "{:+.1f}")
+    return table
 
 
-def _contrast_cells(gains: Table, comparisons: int) -> list[object]:
-    """Mean, bounds and number of positive ones of gains (runs,); `-` where there are too few."""
-    if not len(gains):
-        return ["-", "-", "-"]
-    bounds = "-"
-    low, high = seeds_interval(gains, comparisons)
-    if not math.isnan(low):
-        bounds = f"{low:+.1f} to {high:+.1f}"
-    return [f"{gains.mean():+.1f}", bounds, int((gains > 0).sum())]
+def gate(scores: Table, suite: str) -> str:
+    """Say whether joint training, which has all frames, shows that the budget suffices."""
+    joint = scores[FINAL].groupby("strategy").mean().get("joint")
+    if joint is None:
+        return "Joint training was not run; it shows whether the budget suffices."
+    verdict = "the budget suffices for a verdict"
+    if joint < GATE:
+        verdict = f"below {GATE:.0f} %: more steps are needed for a verdict"
+    return (
+        f"Joint training has {joint:.1f} % at {thresholds(suite)[0].text}, {verdict}."
+    )
 
 
 def seeds_interval(values: Sequence[float], comparisons: int = 1) -> Pair:
@@ -209,24 +256,29 @@ def seeds_interval(values: Sequence[float], comparisons: int = 1) -> Pair:
     return mean - half, mean + half
 
 
-def formatted(table: Table) -> Table:
-    """Format numbers with one digit; NaN becomes `-`."""
-    return table.map("{:.1f}".format).where(table.notna(), "-")
+def formatted(table: Table, number: str = "{:.1f}") -> Table:
+    """Format numbers, by default with one digit; NaN becomes `-`."""
+    return table.map(number.format).where(table.notna(), "-")
 
 
-def summary(results: Table) -> dict[str, list[JsonObject]]:
-    """Summarize every complete run for JSON, by strategy; NaN becomes None."""
+def summary(results: Table, suite: str = "") -> dict[str, list[JsonObject]]:
+    """Summarize every complete run for JSON, by strategy; NaN becomes None.
+
+    Forgetting is at the threshold of the suite.
+    """
     strategies = {}
+    threshold, _ = thresholds(suite)
     for name, seed, run in _runs(results):
         last = last_stage(run).iloc[0]
-        coarse = matrix(run)
+        judged = matrix(run, threshold)
         strategies.setdefault(name, []).append(
             {
                 "seed": seed,
-                "scenes": list(coarse.columns),
-                "accuracy_5cm_5deg": _plain(coarse),
-                "accuracy_1cm_1deg": _plain(matrix(run, FINE_COLUMN)),
-                **continual(coarse).to_dict(),
+                "scenes": list(judged.columns),
+                "threshold": threshold.text,
+                "accuracy_5cm_5deg": _plain(matrix(run, _COARSE)),
+                "accuracy_1cm_1deg": _plain(matrix(run, _FINE)),
+                **continual(judged).to_dict(),
                 "memory_bytes": int(last["memory_bytes"]),
                 "head_bytes": int(last["head_bytes"]),
                 "seconds": _seconds(run),

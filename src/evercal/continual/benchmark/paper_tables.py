@@ -5,12 +5,12 @@ Tables 1 to 3 have scenes down and strategies across. Table 4 adds SARS, then SP
 
 from collections.abc import Mapping
 from math import isinf, nan
+from pathlib import Path
 
 import pandas as pd
 
 from evercal.continual.benchmark import comparison
 from evercal.continual.benchmark.results import Table
-from evercal.typing import Pair
 
 ABLATIONS: Mapping[str, tuple[tuple[str, str], ...]] = {
     "as printed": (
@@ -43,100 +43,98 @@ TABLE4 = (
     "reservoir_spdd",
 )
 """Strategies of `ABLATIONS`."""
-PUBLISHED: Mapping[str, Mapping[str, Pair]] = {
-    "i7s": {
-        "joint": (81.7, nan),
-        "finetune": (1.1, nan),
-        "icarl": (65.2, 11.37),
-        "buff_cs": (66.1, 13.03),
-        "gec": (26.5, 62.67),
-        "gdr": (59.6, 12.25),
-        "sars_old_output": (72.0, nan),
-        "sars_spdd": (74.9, 6.65),
-    },
-    "i12s": {
-        "joint": (96.9, nan),
-        "finetune": (6.2, nan),
-        "icarl": (66.0, 33.3),
-        "buff_cs": (83.1, 15.7),
-        "gec": (13.5, 88.9),
-        "gdr": (78.7, 21.9),
-        "sars_old_output": (90.9, nan),
-        "sars_spdd": (91.8, 8.1),
-    },
-}
-"""Published final accuracy and TFR in per cent, by suite and strategy."""
+_PUBLISHED = Path(__file__).with_name("published.csv")
+"""The rows of Tables 1 to 4 of the paper, as printed."""
+_ACCURACY = "Acc, %"
+"""Column of accuracy, and of TFR in its row."""
+
+
+def published(suite: str) -> Table:
+    """Read the paper's rows of a suite; those of its Sim data set for suites `sim*`."""
+    rows = pd.read_csv(_PUBLISHED)
+    name = suite
+    if suite.startswith("sim"):
+        name = "sim"
+    return rows[rows["suite"] == name].drop(columns="suite")
+
+
+def published_totals(suite: str) -> Table:
+    """The paper's mean accuracy and TFR of a suite, per cent: a row per strategy."""
+    rows = published(suite)
+    totals = rows[rows["scene"].isin(["Mean", "TFR"])]
+    by_name = totals.pivot(index="strategy", columns="scene", values=_ACCURACY)
+    return by_name.reindex(columns=["Mean", "TFR"])
 
 
 def paper_table(results: Table, suite: str = "") -> Table:
     """Tabulate final median errors and accuracies by scene, then mean and TFR, means over runs.
 
-    Accuracy is at 1 cm and 1 deg for simulated suites, as in the paper, and at 5 cm and 5 deg for
-    others. Published numbers of the suite are added if there are any.
+    Accuracy and TFR are at the threshold of the suite. The published rows follow if there are any.
     """
     results = comparison.complete_runs(results)
     last = comparison.last_stage(results)
-    within = comparison.COARSE_COLUMN
-    if suite.startswith("sim"):
-        within = comparison.FINE_COLUMN
+    threshold, _ = comparison.thresholds(suite)
     cells: Table = pd.DataFrame(
         {
             "t, cm": last["median_mm"] / 10,
             "r, deg": last["median_deg"],
-            "Acc, %": 100 * last[within] / last["frames"],
+            _ACCURACY: 100 * last[threshold.column] / last["frames"],
         }
     )
     means = cells.groupby([last["scene"], last["strategy"]], sort=False).mean()
-    table = means.unstack(sort=False).swaplevel(axis=1)
+    table = _side_by_side(means)
     names = list(last["strategy"].unique())
     table = table.reindex(columns=pd.MultiIndex.from_product([names, cells.columns]))
-    by_strategy = comparison.run_scores(results)["TFR"].groupby("strategy")
+    by_strategy = comparison.run_scores(results, suite)[comparison.TFR].groupby(
+        "strategy"
+    )
     forgetting = by_strategy.agg(lambda values: values.mean(skipna=False))
-    totals = {
-        "Mean": dict(table.xs("Acc, %", axis=1, level=1).mean()),
-        "TFR": dict(forgetting),
-    }
-    published = pd.DataFrame(PUBLISHED.get(suite, {}), ["Mean", "TFR"])
-    for title, values in published.iterrows():
-        if len(values):
-            totals[f"{title}, published"] = dict(values)
+    totals = {"Mean": table.xs(_ACCURACY, axis=1, level=1).mean(), "TFR": forgetting}
     for title, values in totals.items():
         table.loc[title] = nan
         for name in names:
-            table.loc[title, (name, "Acc, %")] = values.get(name, nan)
+            table.loc[title, (name, _ACCURACY)] = values[name]
+    theirs = _side_by_side(published(suite).set_index(["scene", "strategy"]))
+    theirs.index += ", published"
+    table = pd.concat([table, theirs.reindex(columns=table.columns)])
     table.index.name = None
     return table.rename_axis(columns=[None, None])
+
+
+def _side_by_side(rows: Table) -> Table:
+    """Put rows of a scene and a strategy side by side: strategies, then their columns, across."""
+    return rows.unstack(sort=False).swaplevel(axis=1)
 
 
 def ablation_table(scores: Table, suite: str = "") -> Table:
     """Tabulate Table 4: final accuracy, and the gain of each step with its 95 % interval.
 
-    Steps that were not run are left out, and ablations with fewer than two. Published numbers of
-    the suite are added if there are any.
+    Steps that were not run are left out, and ablations with fewer than two. The accuracy at the
+    other threshold is beside it, and the published one if there is any.
     """
-    final = scores[comparison.FINAL].groupby("strategy").mean()
+    means = scores[comparison.finals(scores)].groupby("strategy").mean()
+    theirs = published_totals(suite)["Mean"]
     rows = []
-    published = PUBLISHED.get(suite)
     for title, steps in ABLATIONS.items():
-        if final.index.isin(dict(steps).values()).sum() < 2:
+        if means.index.isin(dict(steps).values()).sum() < 2:
             continue
         before = ""
         for label, name in steps:
             step = comparison.contrast_table(scores, [(name, before)]).iloc[0]
             before = name
-            if name not in final:
+            if name not in means.index:
                 continue
             row = {
                 "ablation": title,
                 "": label,
-                comparison.FINAL: f"{final[name]:.1f}",
-                "step": step[comparison.FINAL],
-                "95 %": step["bounds"].iloc[0],
+                **means.loc[name].map("{:.1f}".format),
+                "step": step["points"],
+                "95 %": f"{step['low']} to {step['high']}",
             }
-            if published:
+            if "sars_old_output" in theirs:  # the paper has this table for the suite
                 row["published %"] = ""
                 if title == "as printed":
-                    row["published %"] = f"{published[name][0]:.1f}"
+                    row["published %"] = f"{theirs[name]:.1f}"
             rows.append(row)
     return pd.DataFrame(rows)
 

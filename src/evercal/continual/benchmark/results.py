@@ -39,8 +39,6 @@ STRATEGIES = "strategies.json"
 """File of the descriptions of strategies."""
 ENVIRONMENTS = "environments.json"
 """File of commits, versions and processors."""
-UNALIGNED = ":unaligned"
-"""Suffix of a strategy for results by the first pose, before landmarks are aligned."""
 WITHIN = {
     "within_10cm_10deg": (0.10, math.radians(10.0)),
     "within_5cm_5deg": metrics.COARSE,
@@ -154,9 +152,8 @@ def _append_rows(path: Path, rows: Table) -> None:
 
 
 def run_of(results: Table, strategy: str, seed: int) -> Table:
-    """Return the rows of a run, under every name of its strategy (`NAME:PART`)."""
-    names = results["strategy"].str.split(":").str[0]
-    return results[(names == strategy) & (results["seed"] == seed)]
+    """Return the rows of a run."""
+    return results[(results["strategy"] == strategy) & (results["seed"] == seed)]
 
 
 def read(folder: Path) -> Table:
@@ -204,15 +201,10 @@ def record_environment(folder: Path) -> str:
     text = json.dumps(record, sort_keys=True)
     key = hashlib.blake2b(text.encode(), digest_size=4).hexdigest()
     with locked(folder):
-        before = read_environments(folder)
+        before = read_records(folder / ENVIRONMENTS)
         if key not in before:
             write_json(folder / ENVIRONMENTS, before | {key: record})
     return key
-
-
-def read_environments(folder: Path) -> JsonObject:
-    """Read the records of a folder by key; empty without the file."""
-    return read_records(folder / ENVIRONMENTS)
 
 
 def read_records(path: Path) -> JsonObject:

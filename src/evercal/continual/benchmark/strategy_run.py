@@ -1,7 +1,7 @@
 """One run: a strategy with a seed over a sequence of scenes, resumed where it was interrupted."""
 
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import field, replace
 from functools import cache
 from pathlib import Path
@@ -12,8 +12,8 @@ import pandas as pd
 from filelock import FileLock
 
 from evercal.classes import frozen
+from evercal.continual.benchmark.overlays import record_overlays
 from evercal.continual.benchmark.results import (
-    UNALIGNED,
     StageResults,
     frame_row,
     record_environment,
@@ -38,7 +38,6 @@ from evercal.continual.threshold import fit_threshold
 from evercal.evaluation.protocol import evaluate
 from evercal.learning.scene import learn_scene
 from evercal.localization.localizer import Localizer
-from evercal.localization.options import LocalizeOptions
 from evercal.localization.pictures import SceneLocalizer
 from evercal.mapping.store import MapStore
 from evercal.recordings import Recording, stated_poses
@@ -122,31 +121,29 @@ class _Run:
         self.store.with_name(f".{self.store.name}.lock").unlink(missing_ok=True)
 
     def _evaluated(
-        self,
-        localizers: Mapping[str, SceneLocalizer],
-        number: int,
-        costs: Record,
+        self, localizer: SceneLocalizer, number: int, costs: Record
     ) -> StageResults:
-        """Evaluate all scenes learned so far by localizers, by the names of their results."""
+        """Evaluate all scenes learned so far."""
         results = []
         frames = []
         costs = {**costs, "environment": record_environment(self.out)}
+        run = {"strategy": self.strategy.name, "seed": self.stage.seed}
         learned = {scene.name: scene for scene in self.scenes[: number + 1]}
-        for name, localizer in localizers.items():
-            run = {"strategy": name, "seed": self.stage.seed}
-            evaluated = evaluate(localizer, learned)
-            for scene in learned:
-                of_scene = [frame for frame in evaluated if frame.scene == scene]
-                results.append({**run, "stage": number, **scene_row(of_scene), **costs})
-                frames += [run | frame_row(frame) for frame in of_scene]
+        evaluated = evaluate(localizer, learned)
+        for scene in learned:
+            of_scene = [frame for frame in evaluated if frame.scene == scene]
+            results.append({**run, "stage": number, **scene_row(of_scene), **costs})
+            frames += [run | frame_row(frame) for frame in of_scene]
         table = pd.DataFrame(frames)
         if len(learned) < len(self.scenes):
             table = table[:0]
+        else:
+            record_overlays(self.out, self.strategy.name, self.scenes, evaluated)
         return StageResults(number, pd.DataFrame(results), table)
 
 
 class _MapRun(_Run):
-    """Builds a map; it is also evaluated without alignment."""
+    """Builds a map."""
 
     def stages(self) -> Iterator[StageResults]:
         if not is_store(self.store):
@@ -161,18 +158,13 @@ class _MapRun(_Run):
                 scene, report = learn_scene(self.scenes[number], contents, size)
                 opened.commit(scene, report.to_dict())
                 contents = opened.contents
-            name = self.strategy.name
-            named = {
-                name: Localizer(contents),
-                name + UNALIGNED: Localizer(contents, LocalizeOptions(align=False)),
-            }
             costs = {
                 "seconds": float(opened.reports()[-1]["seconds"]),
                 "memory_bytes": contents.memory_bytes,
                 "head_bytes": 0,
                 "frames_kept": len(contents.scenes[-1].keyframes),
             }
-            yield self._evaluated(named, number, costs)
+            yield self._evaluated(Localizer(contents), number, costs)
         self._remove()
 
     def _opened(self) -> MapStore:
@@ -280,8 +272,8 @@ class _NetworkRun(_Run):
             "head_bytes": sum(map(head_bytes, scenes.heads)),
             "frames_kept": scenes.frames_kept,
         }
-        named = {self.strategy.name: NetworkLocalizer(scenes, NETWORK_LOCALIZE)}
-        return self._evaluated(named, number, costs)
+        localizer = NetworkLocalizer(scenes, NETWORK_LOCALIZE)
+        return self._evaluated(localizer, number, costs)
 
 
 def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOptions:
