@@ -33,11 +33,7 @@ def test_bench_and_its_tables(run, small, arcs, tmp_path):
     first = run("bench", *words, "--out", tmp_path / "out")
     assert first.code == 0, first.err
     assert "[4/4] finetune seed 0: one " in first.out
-    # A map is also evaluated without alignment, under its own name.
-    line = next(
-        line for line in first.out.splitlines() if line.startswith("[2/4] evercal")
-    )
-    assert "evercal:unaligned seed 0: one " in line
+    assert "two 100.0 % at 5 cm and 5 deg (" in first.out
     assert "evercal - finetune" in first.out
     assert "BWT (backward transfer): mean change" in first.out
     again = run("bench", *words, "--out", tmp_path / "out", "--json")
@@ -52,7 +48,9 @@ def test_bench_and_its_tables(run, small, arcs, tmp_path):
     assert (
         r"\multicolumn{3}{c}{finetune}" in (tmp_path / "out" / "tables.tex").read_text()
     )
-    assert "<svg" in (tmp_path / "out" / "figure.svg").read_text()
+    for name in ("figure.svg", "bars.svg"):
+        assert "<svg" in (tmp_path / "out" / name).read_text()
+    assert "![contours" in (tmp_path / "out" / "tables.md").read_text()
 
 
 def test_held_out_frames_are_training_frames(run, small, arcs, tmp_path):
