@@ -13,14 +13,7 @@ from tyro.conf import Positional
 from evercal.cli.args import Device
 from evercal.cli.bench import Bench
 from evercal.continual.learning.presets import preset
-from evercal.continual.methods.gec import EpisodicConstraint
-from evercal.continual.methods.penalties import (
-    BoundedByTeacher,
-    Distillation,
-    OldOutput,
-)
-from evercal.continual.methods.replay import Replay
-from evercal.continual.strategies import STRATEGIES, Strategy
+from evercal.continual.strategies import Strategy, strategy_named
 from evercal.errors import InputError
 
 STEPS = preset("converged").fit.iterations
@@ -46,27 +39,6 @@ PAPER = ("sars_spdd", "joint", "finetune", "icarl", "buff_cs", "gec")
 """Strategies of the paper's table."""
 
 
-def tuned(spdd: float) -> dict[str, Strategy]:
-    """Return the tuned strategies (results/tuned-converged.csv and tuned-paper-head.csv).
-
-    Args:
-        spdd: Scale of SPDD: 10 for our network, 1 for the paper's head.
-    """
-    penalty = Distillation(scale=spdd)
-    methods = {
-        "er": Replay(weight=3.0),
-        "icarl": Replay("herding", OldOutput(), weight=1.0),
-        "buff_cs": Replay("coverage", BoundedByTeacher(), weight=1.0),
-        "sars_spdd": Replay("sars", penalty),
-        "gec": EpisodicConstraint(alpha=512.0),
-        "sars_old_output": Replay("sars", OldOutput(), weight=1.0),
-        "sars_reprojection": Replay("sars", weight=3.0),
-        "reservoir_spdd": Replay("reservoir", penalty),
-        "sars_spdd_filled": Replay("sars_filled", penalty),
-    }
-    return {name: Strategy(name, method) for name, method in methods.items()}
-
-
 @dataclass(frozen=True)
 class Experiment(Bench):
     """`evercal bench` with given strategies."""
@@ -78,17 +50,16 @@ class Experiment(Bench):
         return self.compared
 
 
-def chosen(names: Sequence[str], known: Mapping[str, Strategy]) -> tuple[Strategy, ...]:
-    """Return strategies by name: those of `known`, else those of `evercal bench`."""
-    return tuple(known.get(name) or STRATEGIES[name] for name in names)
+def chosen(names: Sequence[str], paper_head: bool = False) -> tuple[Strategy, ...]:
+    """Return strategies by name, with the weights of our network or of the paper's."""
+    return tuple(strategy_named(name, paper_head) for name in names)
 
 
 def experiments(
     data: Path, out: Path, device: Device
 ) -> Mapping[str, Sequence[Experiment]]:
     """Return the calls of every experiment, in order."""
-    ours = tuned(10.0)
-    every = [*CONTROLS, *ours.keys() - {"sars_spdd_filled"}]
+    every = dict.fromkeys((*CONTROLS, *CONTRASTS, "gec"))
 
     def bench(suite: str, name: str, names: Sequence[str], seeds: str) -> Experiment:
         return Experiment(
@@ -98,14 +69,14 @@ def experiments(
             order="balanced",
             preset="converged",
             seeds=seeds,
-            compared=chosen(names, ours),
+            compared=chosen(names),
             device=device,
         )
 
     gate = bench("sim-mini", "networks-a", ["joint"], SEEDS)
     head = bench("sim-mini", "networks-b", ["joint"], FEW_SEEDS)
     head = replace(head, steps=4 * STEPS, backbone="paper_head")
-    tuned_head = chosen([*COMPARED, "finetune"], tuned(1.0))
+    tuned_head = chosen([*COMPARED, "finetune"], paper_head=True)
     unseen = bench("sim-unseen", "networks-c", BOUNDED, FEW_SEEDS)
     unseen = replace(unseen, steps=2 * STEPS)
     real = bench("real2", "networks-real", BOUNDED, FEW_SEEDS)
@@ -118,16 +89,19 @@ def experiments(
     return {
         "gate": [gate],
         "a": [
-            replace(gate, compared=chosen(every, ours)),
-            replace(gate, compared=chosen(CONTRASTS, ours), seeds=MORE_SEEDS),
+            replace(gate, compared=chosen([*every])),
+            replace(gate, compared=chosen(CONTRASTS), seeds=MORE_SEEDS),
         ],
         "memory": memory,
         "b": [head, replace(head, compared=tuned_head)],
-        "c": [unseen, replace(unseen, compared=chosen(["evercal"], ours), seeds="0")],
+        "c": [unseen, replace(unseen, compared=chosen(["evercal"]), seeds="0")],
         "real": [replace(real, steps=2 * STEPS)],
         "paper": [
             replace(
-                paper, preset="paper", order=Bench.order, compared=chosen(PAPER, {})
+                paper,
+                preset="paper",
+                order=Bench.order,
+                compared=chosen(PAPER, paper_head=True),
             )
         ],
     }

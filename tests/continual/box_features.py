@@ -36,10 +36,9 @@ def learnable(box: BoxRoom) -> Learnable:
         scene: int = 0,
         views: int = 6,
         lens: Camera | None = None,
-        correctable: bool = False,
     ) -> tuple[FeatureBuffer, Tensor]:
         rng = np.random.default_rng(scene)
-        buffer = FeatureBuffer(scene, ATLAS_FROM_BASE, correctable)
+        buffer = FeatureBuffer(scene, ATLAS_FROM_BASE)
         everything = []
         for _ in range(views):
             pose = box.random_view(rng)

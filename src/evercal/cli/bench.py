@@ -109,7 +109,6 @@ class Bench(args.Verb, Training):
 
     def _strategies(self) -> "tuple[Strategy, ...]":
         from evercal.continual.benchmark.paper_tables import TABLE4
-        from evercal.continual.strategies import strategy_named
 
         names: list[str] = []
         for word in _words(self.strategies):
@@ -117,7 +116,7 @@ class Bench(args.Verb, Training):
                 names += TABLE4
             else:
                 names.append(word)
-        return tuple(map(strategy_named, dict.fromkeys(names)))
+        return tuple(map(self.strategy, dict.fromkeys(names)))
 
     def _recorded(self) -> "list[Recording]":
         from evercal.continual.benchmark.suites import load_suite

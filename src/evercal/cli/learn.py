@@ -261,13 +261,12 @@ def learn_into_networks(
         NetworkLearnOptions,
         learn_networks,
     )
-    from evercal.continual.strategies import strategy_named
 
     wanted = given.networks
     if wanted.seed < 0:
         raise InputError(f"--seed {wanted.seed}: give a number >= 0")
     wanted.load_plugin()
-    chosen = strategy_named(strategy)
+    chosen = wanted.strategy(strategy)
     if wanted.weight is not None:
         chosen = chosen.weighted(wanted.weight)
     options = NetworkLearnOptions(

@@ -13,6 +13,7 @@ from evercal.progress import Bars
 
 if TYPE_CHECKING:
     from evercal.continual.learning.stage import StageOptions
+    from evercal.continual.strategies import Strategy
 
 LEAST_BATCH = 64
 """Smallest number of rows in a step that learns anything."""
@@ -47,6 +48,13 @@ class Training:
             from evercal.continual.strategies import load_plugin
 
             load_plugin(self.plugin)
+
+    def strategy(self, name: str) -> "Strategy":
+        """A strategy with the weight that was tuned on the network."""
+        from evercal.continual.strategies import strategy_named
+
+        ours = self.backbone == "evercal" and self.preset != "paper"
+        return strategy_named(name, paper_head=not ours)
 
     def stage(
         self, seed: int, memory: str, centres: Literal["grow", "fixed"] = "grow"

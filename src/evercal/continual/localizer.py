@@ -15,12 +15,12 @@ from evercal.continual.networks.precision import autocast
 from evercal.continual.scenes import LearnedScenes, SceneRecord
 from evercal.continual.store import NetworkStore
 from evercal.errors import InputError, require_numbers
-from evercal.geometry import SE3, Camera
+from evercal.geometry import Camera
 from evercal.localization.estimate import PoseEstimate
 from evercal.localization.hypothesis import Matches, Rough
 from evercal.localization.intrinsics import cameras_in_scenes
 from evercal.localization.matching import strided_patches
-from evercal.localization.pnp import PnpOptions, PnpResult, solve_pnp, uncertain
+from evercal.localization.pnp import PnpOptions, solve_pnp, uncertain
 from evercal.localization.query import Encoded
 from evercal.recordings.images import as_rgb
 from evercal.typing import Image, Strings
@@ -37,7 +37,8 @@ class NetworkLocalizeOptions:
     pnp: PnpOptions = field(default_factory=lambda: PnpOptions(threshold_px=8.0))
     """RANSAC settings. Points of a network scatter more than landmarks, so the radius is wider."""
     refuses: bool = True
-    """Whether a pose with too few inliers is refused; published methods answer for every image."""
+    """Whether a pose with too few inliers is refused. Published methods answer for every image.
+    Their poses have no covariance, because its scale is fitted together with the threshold."""
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -79,8 +80,7 @@ class NetworkLocalizer:
         """Locate an image; see `Localizer.localize`.
 
         Inliers are patches whose predicted points agree with the pose, and the ratio is that of all
-        patches. There are no `camera`, `terms` and `support`. The status is `failed` as well if the
-        pose lies outside the cell of its scene.
+        patches. There are no `camera`, `terms` and `support`.
         """
         began = perf_counter()
         image = as_rgb(image)
@@ -89,21 +89,22 @@ class NetworkLocalizer:
         features = scenes.encoder.encode(image, scenes.short_side)
         encoded = Encoded(features)
         scenes_tried = self._candidates(encoded, cameras)
-        tried = [self._hypothesis(encoded, scene, cameras) for scene in scenes_tried]
+        tried = []
+        for scene in scenes_tried:
+            camera = cameras[scene]
+            assert camera, "only scenes whose camera fits are tried"
+            tried.append(self._hypothesis(encoded, scene, camera))
         best = max(tried, key=_support)
         return self._answer(best, 1000 * (perf_counter() - began))
-
-    @property
-    def _decides_scene(self) -> bool:
-        heads = self.contents.heads
-        return len(heads) == 1 and heads[0].options.condition == "descriptor"
 
     def _candidates(
         self, encoded: Encoded, cameras: Sequence[Camera | None]
     ) -> list[int]:
+        """Scenes to try, whose prototypes are most similar to the image's descriptor.
+
+        A head that reads the descriptor has one output for all scenes, so only the first is tried.
+        """
         usable = [i for i, camera in enumerate(cameras) if camera]
-        if self._decides_scene:
-            return usable[:1]
         _, descriptor = described(encoded.features, self.contents.descriptor)
         similarity = np.full(len(cameras), -np.inf)
         for i in usable:
@@ -111,42 +112,27 @@ class NetworkLocalizer:
         floor = similarity.max() - self.options.margin
         best_first = np.argsort(-similarity, kind="stable")
         similar = best_first[similarity[best_first] >= floor]
-        return similar[: self.options.candidates].tolist()
+        count = self.options.candidates
+        heads = self.contents.heads
+        if len(heads) == 1 and heads[0].options.condition == "descriptor":
+            count = 1
+        return similar[:count].tolist()
 
     def _hypothesis(
         self,
         encoded: Encoded,
         scene: int,
-        cameras: Sequence[Camera | None],
-        moved: bool = False,
+        camera: Camera,
     ) -> Rough | None:
-        camera = cameras[scene]
-        assert camera, "only scenes whose camera fits are tried"
         small = camera.short_side_resized(self.contents.short_side)
         matches, patches = self._predicted(encoded, scene, small)
         rough = solve_pnp(matches.pixels, matches.points_m, small, self.options.pnp)
         if not rough:
             return None
-        if self._decides_scene and not moved:
-            other = self._scene_at(rough.pose, scene)
-            if other is None:
-                other = scene
-            if cameras[other] not in (None, camera):
-                # The pose lies in the cell of a scene with another camera: solve once more.
-                return self._hypothesis(encoded, other, cameras, moved=True)
-            if other != scene:
-                atlas_from_other = self._atlas_from_base(other)
-                across = atlas_from_other.inverse() @ self._atlas_from_base(scene)
-                rough = PnpResult(across @ rough.pose, rough.inliers)
-                matches = Matches(matches.pixels, across.apply(matches.points_m))
-                scene = other
         pixels = matches.pixels[rough.inliers]
         points = matches.points_m[rough.inliers]
         pose = uncertain(pixels, points, small, rough.pose)
         return Rough(scene, pose, pixels, points, patches, len(pixels))
-
-    def _atlas_from_base(self, scene: int) -> SE3:
-        return self.contents.scenes[scene].cell.atlas_from_base
 
     @torch.inference_mode()
     def _predicted(
@@ -160,16 +146,10 @@ class NetworkLocalizer:
         with autocast(head.device):
             output = head(features, local, descriptor.expand(len(features), -1))
         in_atlas = output.points.cpu().double().numpy()
-        base_from_atlas = self._atlas_from_base(scene).inverse()
+        base_from_atlas = scenes.scenes[scene].cell.atlas_from_base.inverse()
         points = base_from_atlas.apply(in_atlas)[patches]
         valid = np.isfinite(points).all(1)
         return Matches(pixels[valid], points[valid]), len(patches)
-
-    def _scene_at(self, base_from_camera: SE3, scene: int) -> int | None:
-        """The scene in whose cell a pose of one scene lies."""
-        atlas_from_base = self._atlas_from_base(scene)
-        position = atlas_from_base.apply(base_from_camera.translation_m)
-        return self.contents.atlas().scene_at(position)
 
     def _answer(self, best: Rough | None, milliseconds: float) -> PoseEstimate:
         if not best:
@@ -189,18 +169,19 @@ class NetworkLocalizer:
         )
         if status != "ok":
             return estimate
+        covariance = None
+        if self.options.refuses:
+            covariance = record.covariance_scale * best.pose.covariance
         return replace(
             estimate,
             scene=record.name,
             base_from_camera=best.pose.pose,
-            covariance=record.covariance_scale * best.pose.covariance,
+            covariance=covariance,
             pixels=best.pixels,
             points_m=best.points_m,
         )
 
     def _status(self, best: Rough, record: SceneRecord):
-        if self._scene_at(best.pose.pose, best.scene) != best.scene:
-            return "failed", "the pose lies outside the cell of its scene"
         if self.options.refuses and best.inlier_ratio < record.inlier_threshold:
             share = 100 * best.inlier_ratio
             need = 100 * record.inlier_threshold

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from evercal.classes import frozen
 from evercal.continual.networks.atlas import Atlas, Cell
-from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.descriptor import Descriptor
 from evercal.continual.networks.device import device_of_network
 from evercal.continual.networks.head import Head
@@ -38,8 +37,6 @@ class SceneRecord:
     """(p, width) descriptors of training frames spread over the recording, half precision."""
     train_frames: int
     """Number of training frames."""
-    refined_camera: Camera | None = None
-    """`camera` as training corrected it; None without a correction."""
     inlier_threshold: float = 0.0
     """Poses with a smaller inlier ratio are rejected; fitted to held-out training frames."""
     covariance_scale: float = 1.0
@@ -47,20 +44,8 @@ class SceneRecord:
 
     @property
     def adjusted_camera(self) -> Camera:
-        """Intrinsics for images of the camera that recorded the scene."""
-        return self.refined_camera or self.camera
-
-    def correct_lens(self, rows: FeatureBuffer) -> None:
-        """Apply the intrinsics of the training to the scene's rows; see `corrected_camera`."""
-        nominal = self.camera
-        refined = self.refined_camera
-        if not refined:
-            return
-        focal = refined.fx / nominal.fx - 1
-        dx = (refined.cx - nominal.cx) / nominal.fx
-        dy = (refined.cy - nominal.cy) / nominal.fy
-        k1, k2 = refined.distortion[:2] or (0.0, 0.0)
-        rows.correct_lens(torch.tensor([focal, dx, dy, k1, k2]))
+        """Intrinsics for images of the camera that recorded the scene: the stated ones."""
+        return self.camera
 
     @property
     def frame(self) -> MapFrame:
@@ -137,20 +122,6 @@ class LearnedScenes:
             keyframes=list(self.keyframes),
             method_states=list(self.method_states),
         )
-
-
-def corrected_camera(camera: Camera, correction: Tensor) -> Camera:
-    """A nominal pinhole with the correction (5,) of training (see `reprojection_error`)."""
-    focal, dx, dy, k1, k2 = correction.tolist()
-    return Camera(
-        width=camera.width,
-        height=camera.height,
-        fx=camera.fx * (1 + focal),
-        fy=camera.fy * (1 + focal),
-        cx=camera.cx + dx * camera.fx,
-        cy=camera.cy + dy * camera.fy,
-        distortion=(k1, k2, 0.0, 0.0),
-    )
 
 
 def prototypes(descriptors: Tensor) -> Tensor:

@@ -214,9 +214,7 @@ def _plain(record: SceneRecord) -> JsonObject:
     """A record as in its file, without its prototypes."""
     content = {**vars(record), "cell": asdict(record.cell)}
     del content["prototypes"]
-    for name in ("camera", "refined_camera"):
-        if content[name] is not None:
-            content[name] = content[name].to_dict()
+    content["camera"] = record.camera.to_dict()
     return content
 
 
@@ -229,8 +227,8 @@ def _read_record(folder: Path) -> SceneRecord:
         side_m=cell["side_m"],
         origin_m=tuple(cell["origin_m"]),
     )
-    for name in ("camera", "refined_camera"):
-        if content[name] is not None:
-            content[name] = Camera.from_dict(content[name])
+    # Stores of version 0.1 may hold intrinsics that training estimated.
+    camera = content.pop("refined_camera", None) or content["camera"]
+    content["camera"] = Camera.from_dict(camera)
     tensors = _tensors(folder / PROTOTYPES)
     return SceneRecord(prototypes=tensors["prototypes"], **content)

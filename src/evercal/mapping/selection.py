@@ -37,7 +37,10 @@ class SarsOptions:
     rotation_weight: float = 1.0
     """Weight lambda of the rotation angle (scene sides per radian)."""
     fill: bool = False
-    """Ignore `radius` and use the largest one that fills the capacity."""
+    """Ignore `radius` and search one that fills the capacity.
+
+    Bisection assumes that all smaller radii fill it, too. Where some do not, it may miss a larger
+    one."""
 
     def __post_init__(self) -> None:
         """Refuse numbers outside their range.
@@ -140,7 +143,7 @@ def _accept_until_full(
 
 
 def spread_poses(poses: SE3, capacity: int) -> IntArray:
-    """Select some of (n,) poses: by SARS with the largest radius that fills the capacity."""
+    """Select some of (n,) poses: by SARS with a radius that fills the capacity."""
     if len(poses) <= capacity:
         return np.arange(len(poses))
     fill = SarsOptions(fill=True)
@@ -183,7 +186,7 @@ def select_sars(
     space = PoseSpace.of(positions_m, quaternions_wxyz, options.rotation_weight)
     radius = options.radius
     if options.fill:
-        radius = _largest_radius(space, capacity, 1e-5)
+        radius = _filling_radius(space, capacity, 1e-5)
     accepted = _accept_until_full(space, radius, capacity)
     if len(accepted) < capacity or not len(accepted):
         return accepted
@@ -209,7 +212,7 @@ def select_sars(
     return np.sort(frames)
 
 
-def _largest_radius(
+def _filling_radius(
     space: PoseSpace,
     capacity: int,
     tolerance: float,

@@ -146,7 +146,7 @@ def test_centres_lie_in_the_cell_of_their_scene(
         in_atlas = cell.atlas_from_base.apply(positions)
         assert (centres >= in_atlas.min(0) - 1e-5).all()
         assert (centres <= in_atlas.max(0) + 1e-5).all()
-        assert after.atlas().scene_at(centres[0]) == i
+        assert cell.distance_m(centres[0]) < cell.side_m / 2
 
 
 @dataclass(frozen=True)

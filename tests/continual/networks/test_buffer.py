@@ -17,7 +17,6 @@ from evercal.continual.networks.buffer import (
     join,
 )
 from evercal.continual.networks.descriptor import GlobalDescriptor, described
-from evercal.continual.networks.loss import reprojection_error
 from evercal.features.encoder import Encoder
 from evercal.features.views import ViewOptions, augmented_view, cell_centres, frame_view
 from evercal.geometry import SE3, Camera
@@ -219,31 +218,3 @@ def test_part_and_join_are_inverse(filled: Filled) -> None:
         assert torch.equal(getattr(again, name), getattr(rows, name))
     for name in ("pixels", "intrinsics", "camera_from_atlas"):
         assert torch.equal(getattr(again.target, name), getattr(rows.target, name))
-
-
-def test_corrected_rows_follow_an_ideal_pinhole() -> None:
-    points = torch.randn(60, 3, generator=seeded(0))
-    points[:, 2] = points[:, 2].abs() + 3
-    correction = torch.tensor([0.02, 0.01, -0.02, -0.12, 0.03])
-    buffer = FeatureBuffer(0, SE3.identity())
-    rows = {
-        "features": torch.zeros(60, 1).half(),
-        "pixels": torch.zeros(60, 2),
-        "view": torch.arange(3, dtype=torch.int32).repeat_interleave(20),
-        "intrinsics": torch.tensor(
-            [[300.0, 310, 160, 120], [150, 150, 80, 60], [90, 90, 0, 0]]
-        ),
-        "camera_from_atlas": torch.eye(4)[None, :3].repeat(3, 1, 1),
-        "descriptors": torch.ones(3, 2),
-    }
-    buffer.extend(rows)
-    each = torch.arange(60)
-    # Pixels of the points in the corrected camera.
-    captured, _ = reprojection_error(
-        points, buffer.rows(each).target, correction.expand(60, 5)
-    )
-    buffer = FeatureBuffer(0, SE3.identity())
-    buffer.extend({**rows, "pixels": captured})
-    assert reprojection_error(points, buffer.rows(each).target)[0].abs().max() > 3
-    buffer.correct_lens(correction)
-    assert reprojection_error(points, buffer.rows(each).target)[0].abs().max() < 0.01

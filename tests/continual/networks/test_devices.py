@@ -77,10 +77,7 @@ def everything(rows: Rows) -> dict[str, Tensor]:
 def step(head: Head, rows: Rows, scene: Tensor | int) -> dict[str, Tensor]:
     """Compute loss and error of rows, and the gradient of every parameter, in fp32."""
     output = head(rows.features.float(), scene, rows.descriptor)
-    correction = 0.01 * rows.features[:, :5].float()
-    loss, error = reprojection_loss(
-        output.points, rows.target, 7.0, LossOptions(), correction
-    )
+    loss, error = reprojection_loss(output.points, rows.target, 7.0, LossOptions())
     loss.mean().backward()
     gradients = {
         name: p.grad for name, p in head.named_parameters() if p.grad is not None

@@ -170,6 +170,18 @@ def test_new_scenes_do_not_change_the_output_for_old_scenes(
     assert not torch.equal(before[0], before[1])
 
 
+def test_new_centres_of_a_shared_softmax_hardly_move_old_points() -> None:
+    head = grown(SHAPES[3], 1)
+    features = normal(200, FEATURES, seed=1)
+    descriptors = normal(200, DESCRIPTOR, seed=2)
+    with torch.no_grad():
+        before = head(features, 0, descriptors).points
+        head.grow(20 * normal(100, 3, seed=3), seed=3)
+        after = head(features, 0, descriptors).points
+    assert (after - before).norm(dim=-1).max() < 0.005
+    assert len(head.centres) == CENTRES + 100
+
+
 @pytest.mark.parametrize("options", CODED)
 def test_scene_index_and_scene_tensor_agree(options: HeadOptions) -> None:
     head = grown(options, 3)

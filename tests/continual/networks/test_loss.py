@@ -60,32 +60,6 @@ def test_error_matches_the_camera_model() -> None:
     )
 
 
-def test_camera_correction_matches_opencv() -> None:
-    """Relative focal length, principal point in focal lengths, k1 and k2."""
-    poses, in_camera, atlas = scattered(2)
-    correction = [0.03, -0.02, 0.01, -0.15, 0.04]
-    corrected = replace(
-        CAMERA,
-        fx=CAMERA.fx * (1 + correction[0]),
-        fy=CAMERA.fy * (1 + correction[0]),
-        cx=CAMERA.cx + correction[1] * CAMERA.fx,
-        cy=CAMERA.cy + correction[2] * CAMERA.fy,
-        distortion=(correction[3], correction[4], 0.0, 0.0),
-    )
-    pixels = np.zeros((200, 2))
-    points = torch.from_numpy(atlas).float()
-    where = target(pixels, poses)
-    residual, _ = reprojection_error(
-        points, where, torch.tensor([correction]).expand(200, -1)
-    )
-    np.testing.assert_allclose(
-        residual.numpy(), corrected.project(in_camera), atol=2e-2
-    )
-    none, _ = reprojection_error(points, where, torch.zeros(200, 5))
-    plain, _ = reprojection_error(points, where)
-    torch.testing.assert_close(none, plain)
-
-
 def test_circle_schedule_falls_from_51_to_1() -> None:
     for progress, tau in [
         (0.0, 51.0),

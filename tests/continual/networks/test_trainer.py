@@ -11,11 +11,10 @@ from torch import Tensor
 from evercal.continual.networks.buffer import FeatureBuffer, Rows
 from evercal.continual.networks.head import HeadOptions, HeadOutput
 from evercal.continual.networks.hooks import ProposedStep, TrainingHooks
-from evercal.continual.networks.loss import LossOptions, clamp_px, reprojection_error
+from evercal.continual.networks.loss import LossOptions, clamp_px
 from evercal.continual.networks.trainer import FitOptions, HeadTrainer, one_cycle
-from evercal.features.views import cell_centres
 
-from ..box_features import CAMERA, Learnable, head_at_cameras
+from ..box_features import Learnable, head_at_cameras
 from ..draws import seeded
 from ..stages import weights
 
@@ -117,32 +116,6 @@ def test_descriptor_noise_has_the_stated_size(learnable: Learnable) -> None:
     noise[:, 0] += 1  # an arbitrary direction
     expected = float((noise[:, 0] / noise.norm(dim=-1)).mean())
     assert float(cosine.mean()) == pytest.approx(expected, abs=0.02)
-
-
-def test_wrong_intrinsics_are_corrected_if_allowed(learnable: Learnable) -> None:
-    """The true focal length is 4 % longer than stated, and there is barrel distortion."""
-    true = replace(
-        CAMERA, fx=CAMERA.fx * 1.04, fy=CAMERA.fy * 1.04, distortion=(-0.1, 0, 0, 0)
-    )
-    options = FitOptions(
-        batch=512, peak_rate=5e-3, intrinsics_rate=1.0, loss=OPTIONS.loss
-    )
-    rays = torch.from_numpy(true.unproject(cell_centres(120, 160, 8))).float()
-    for correctable, steps in ((True, 250), (False, 20)):
-        buffer, _ = learnable(views=20, lens=true, correctable=correctable)
-        head = head_at_cameras([buffer], HeadOptions(width=64))
-        trainer = HeadTrainer(head, [buffer], replace(options, iterations=steps), 0)
-        list(trainer.run())
-        # Error of the intrinsics alone, at the identity pose.
-        where = buffer.rows(torch.arange(300)).target
-        where.camera_from_atlas = torch.eye(3, 4).expand(300, 3, 4)
-        off, _ = reprojection_error(rays, where, trainer.correction[0].expand(300, 5))
-        stated, _ = reprojection_error(rays, where)
-        if correctable:
-            assert off.norm(dim=-1).mean() < 0.5 * stated.norm(dim=-1).mean()
-            assert trainer.correction[0, 0] > 0.015
-        else:
-            assert (trainer.correction == 0).all()
 
 
 class StepRecorder(Replayed):

@@ -34,14 +34,13 @@ from evercal.continual.networks.feature_cache import cache_features
 from evercal.continual.scenes import LearnedScenes
 from evercal.continual.store import NetworkStore, head_bytes
 from evercal.continual.strategies import STRATEGIES, Strategy
-from evercal.continual.threshold import fit_threshold
 from evercal.evaluation.protocol import evaluate
 from evercal.learning.scene import learn_scene
 from evercal.localization.localizer import Localizer
 from evercal.localization.pictures import SceneLocalizer
 from evercal.mapping.store import MapStore
 from evercal.recordings import Recording, stated_poses
-from evercal.recordings.held_out import split_held_out
+from evercal.recordings.frame import posed_recording
 from evercal.storage.stages import is_store
 from evercal.typing import JsonObject, Record
 
@@ -107,12 +106,12 @@ class _Run:
         out: Path,
     ):
         self.strategy = strategy
-        self.scenes = scenes
+        self.scenes = list(map(posed_recording, scenes))
         self.out = out
         self.device = device_of(options.device)
         self.short_side = options.short_side
         self.on_event = options.on_event
-        self.stage = _with_centres(options.stage(seed), scenes)
+        self.stage = _with_centres(options.stage(seed), self.scenes)
         self.features = out.absolute() / "features"
         self.store = out / "runs" / f"{strategy.name}-{seed}"
 
@@ -190,16 +189,8 @@ class _NetworkRun(_Run):
     def jointly(self) -> Iterator[StageResults]:
         self._remove()  # an interrupted run starts again
         empty = self._prepared(self._new_store().contents)
-        recordings = []
-        held_out = []
-        for scene in self.scenes:
-            split = split_held_out(scene.train)
-            recordings.append(replace(scene, train=split.train))
-            held_out.append(split.held_out)
         began = perf_counter()
-        learned = learn_jointly(empty, recordings, self.stage, self.on_event)
-        for number, frames in enumerate(held_out):
-            learned.scenes[number] = fit_threshold(learned, frames, number)
+        learned = learn_jointly(empty, self.scenes, self.stage, self.on_event)
         seconds = perf_counter() - began
         last = len(self.scenes) - 1
         nothing = pd.DataFrame()
@@ -214,6 +205,7 @@ class _NetworkRun(_Run):
             short_side=self.short_side,
             device=str(self.device),
             cache=self.features,
+            holds_out=False,
         )
         learn_networks(store, scene, options, self.on_event)
 
@@ -248,16 +240,13 @@ class _NetworkRun(_Run):
         scenes.strategy = self.strategy.name
         scenes.keyframes = []
         scenes.method_states = []
-        train = split_held_out(scene.train).train
 
         @cache
         def rows() -> FeatureBuffer:
             [record] = scenes.scenes
-            buffer = StageRows(scenes, self.stage).of_scene(0, record.cell, train)
-            record.correct_lens(buffer)
-            return buffer
+            return StageRows(scenes, self.stage).of_scene(0, record.cell, scene.train)
 
-        finish_scene(scenes, method, train, rows, self.stage)
+        finish_scene(scenes, method, scene.train, rows, self.stage)
         report = first.reports()[-1]
         report["seconds"] = float(report["seconds"]) + perf_counter() - began
         report["frames_kept"] = scenes.frames_kept
@@ -279,7 +268,6 @@ class _NetworkRun(_Run):
 def _with_centres(stage: StageOptions, scenes: Sequence[Recording]) -> StageOptions:
     if stage.head.centres != "fixed" or stage.fixed_centres_m:
         return stage
-    splits = [split_held_out(scene.train) for scene in scenes]
-    positions = [stated_poses(split.train).translation_m for split in splits]
+    positions = [stated_poses(scene.train).translation_m for scene in scenes]
     centres = combined_centres(positions, stage.head.centres_per_scene, stage.seed)
     return replace(stage, grid_scenes=len(scenes), fixed_centres_m=centres)

@@ -19,7 +19,6 @@ from evercal.continual.networks.trainer import HeadTrainer
 from evercal.continual.scenes import (
     LearnedScenes,
     SceneRecord,
-    corrected_camera,
     prototypes,
 )
 from evercal.continual.selection.frame_statistics import FrameStatistics
@@ -67,8 +66,7 @@ def learn(
     trainer = HeadTrainer(head, [buffer], options.fit, options.seed, hooks)
     for progress in trainer.run():
         on_event(progress)
-    after.scenes.append(trained_record(recording, cell, trainer, 0))
-    after.scenes[-1].correct_lens(buffer)
+    after.scenes.append(trained_record(recording, cell, buffer))
     finish_scene(after, method, recording.train, lambda: buffer, options)
     return after
 
@@ -101,7 +99,7 @@ def learn_jointly(
         on_event(progress)
     for number, recording in enumerate(recordings):
         cell = atlas.cells[number]
-        after.scenes.append(trained_record(recording, cell, trainer, number))
+        after.scenes.append(trained_record(recording, cell, buffers[number]))
         after.keyframes.append(None)
         after.method_states.append({})
     return after
@@ -174,8 +172,7 @@ def finish_scene(
 ) -> None:
     """Select what is stored of the newest scene and add it to `scenes`, which has its record.
 
-    `rows` returns the rows of its frames with the intrinsics of the training; the first views are
-    not augmented.
+    `rows` returns the rows of its frames; the first views are not augmented.
     """
     newest = len(scenes.scenes) - 1
     head, local = scenes.head_for(newest)
@@ -184,12 +181,7 @@ def finish_scene(
     selected = method.select(statistics, capacity)
     keyframes = None
     if selected is not None:
-        chosen = []
-        refined = scenes.scenes[-1].refined_camera
-        for i in selected:
-            # Replay uses the camera as training corrected it.
-            camera = refined or frames[i].camera
-            chosen.append(replace(frames[i], camera=camera))
+        chosen = [frames[i] for i in selected]
         keyframes = store_keyframes(chosen, scenes.short_side)
         keyframes = keyframes.take(options.memory.fitting(keyframes))
     scenes.keyframes.append(keyframes)
@@ -202,21 +194,14 @@ def finish_scene(
 
 
 def trained_record(
-    scene: Recording, cell: Cell, trainer: HeadTrainer, number: int
+    recording: Recording, cell: Cell, buffer: FeatureBuffer
 ) -> SceneRecord:
-    """The record of a scene after training; its rows are in the trainer's buffer `number`."""
-    buffer = trainer.buffers[number]
-    options = trainer.options
-    camera = scene.train[0].camera
-    refined = None
-    if options.intrinsics_rate > 0 and options.iterations > 0 and buffer.correctable:
-        refined = corrected_camera(camera, trainer.correction[number].detach())
-    frames = len(scene.train)
+    """The record of a scene after training on the rows of a buffer."""
+    frames = len(recording.train)
     return SceneRecord(
-        name=scene.name,
-        camera=camera,
+        name=recording.name,
+        camera=recording.train[0].camera,
         cell=cell,
         prototypes=prototypes(buffer.tensors["descriptors"][:frames]),
         train_frames=frames,
-        refined_camera=refined,
     )

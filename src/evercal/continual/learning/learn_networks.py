@@ -23,7 +23,12 @@ from evercal.recordings.frame import (
     lacks_camera_poses,
     posed_recording,
 )
-from evercal.recordings.held_out import named_recording, require_frames, split_held_out
+from evercal.recordings.held_out import (
+    HeldOutSplit,
+    named_recording,
+    require_frames,
+    split_held_out,
+)
 from evercal.storage.stages import is_store
 
 
@@ -57,6 +62,8 @@ class NetworkLearnOptions:
     """Working size of images in a new store, pixels; that of the preset by default."""
     cache: Path | None = None
     """Folder for features of views, for many runs over the same frames."""
+    holds_out: bool = True
+    """Whether a few training frames are held out to fit the inlier threshold and the covariance."""
 
     def opened(
         self, store: Path, strategy: Strategy, frames: Sequence[Frame]
@@ -103,7 +110,7 @@ def learn_networks(
 
     Args:
         store: folder of the store; created if it is missing.
-        recording: its training frames are learned; a few are held out to fit the threshold.
+        recording: its training frames are learned; by default a few are held out.
         options: strategy and amount of training.
         on_event: called with every event, for progress bars.
     """
@@ -133,10 +140,13 @@ def learn_networks(
         if options.cache:
             cache_features(contents.encoder, options.cache)
             contents.cache = options.cache
-        split = split_held_out(recording.train)
+        split = HeldOutSplit(recording.train, ())
+        if options.holds_out:
+            split = split_held_out(recording.train)
         train = replace(recording, train=split.train)
         learned = learn(contents, strategy.method, train, stage, on_event)
-        learned.scenes[-1] = fit_threshold(learned, split.held_out)
+        if split.held_out:
+            learned.scenes[-1] = fit_threshold(learned, split.held_out)
         report = NetworkReport(
             scene=recording.name,
             seconds=perf_counter() - began,

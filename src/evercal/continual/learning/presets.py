@@ -34,8 +34,7 @@ PRESETS: dict[str, StageOptions] = {
     # (research/protocol.md).
     "converged": _ours(width=256, steps=1200, rows=1536, views=4),
     # The paper's settings, for a GPU: AdamW at 0.005 and 15,000 steps per scene. The rows of a step
-    # are GLACE's. The paper does not state the number of replayed rows; here it is the same. The
-    # stated intrinsics are not corrected.
+    # are GLACE's. The paper does not state the number of replayed rows; here it is the same.
     "paper": StageOptions(
         head=HeadOptions(
             width=768,
@@ -50,7 +49,6 @@ PRESETS: dict[str, StageOptions] = {
             replay_batch=40_960,
             peak_rate=5e-3,
             matrix_rate=0.0,
-            intrinsics_rate=0.0,
             warm_share=0.3,
             loss=LossOptions(schedule="circle", clamp_start_px=50.0),
         ),

@@ -25,18 +25,9 @@ class StageRows:
     def of_scene(
         self, local: int, cell: Cell, frames: Sequence[Frame]
     ) -> FeatureBuffer:
-        """Encode the training frames of a scene; `local` is its index in the head.
-
-        The camera can be corrected if the frames share one without distortion.
-        """
-        camera = frames[0].camera
-        one_camera = all(frame.camera == camera for frame in frames)
-        buffer = FeatureBuffer(
-            scene=local,
-            atlas_from_base=cell.atlas_from_base,
-            correctable=one_camera and not camera.distortion,
-            device=self.scenes.device,
-        )
+        """Encode the training frames of a scene; `local` is its index in the head."""
+        device = self.scenes.device
+        buffer = FeatureBuffer(local, cell.atlas_from_base, device)
         return self._encoded(buffer, frames, self.options.encode)
 
     def of_keyframes(self, number: int) -> FeatureBuffer:
@@ -46,7 +37,7 @@ class StageRows:
         assert keyframes is not None, "a method that uses keyframes selects some"
         cell = scenes.scenes[number].cell
         _, local = scenes.head_for(number)
-        buffer = FeatureBuffer(local, cell.atlas_from_base, device=scenes.device)
+        buffer = FeatureBuffer(local, cell.atlas_from_base, scenes.device)
         views = self.options.replay_views_per_frame
         plan = replace(self.options.encode, views_per_frame=views)
         return self._encoded(buffer, keyframes.frames(), plan)

@@ -174,11 +174,9 @@ class Distillation(Penalty):
 
     options: SpddOptions = field(default_factory=SpddOptions)
     """Weights of the three terms, temperature and active set."""
-    scale: float = 1.0
-    """Pixels per metre and per nat; the paper's value is 1."""
 
     def __call__(
         self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
     ) -> Tensor:
-        """Compute the loss in pixels."""
-        return self.scale * spdd_loss(student, teacher, self.options).total
+        """Compute the loss in metres and nats."""
+        return spdd_loss(student, teacher, self.options).total

@@ -3,8 +3,7 @@
 Most methods differ only in the selected frames and the loss of replayed rows; both are fields.
 """
 
-from dataclasses import field, replace
-from typing import Self
+from dataclasses import field
 
 import torch
 from torch import Generator, Tensor
@@ -12,7 +11,6 @@ from torch import Generator, Tensor
 from evercal.classes import frozen
 from evercal.continual.methods.method import Method, StageStart
 from evercal.continual.methods.penalties import (
-    Distillation,
     Penalty,
     Reprojection,
 )
@@ -74,12 +72,6 @@ class Replay(EpisodicMemory):
     """Weight of the penalty, the mean over the rows of all remembered scenes."""
     every_scene: bool = False
     """Multiply the weight by the number of remembered scenes; the paper has one for all of them."""
-
-    def weighted(self, weight: float) -> Self:
-        """Copy the method with another weight of its penalty; SPDD is weighted by its scale."""
-        if isinstance(self.penalty, Distillation):
-            return replace(self, penalty=replace(self.penalty, scale=weight))
-        return super().weighted(weight)
 
     def hooks(self, start: StageStart) -> TrainingHooks:
         """Replay from the stage's memories."""

@@ -81,13 +81,6 @@ class Atlas:
             cell.distance_m(centre) >= (side + cell.side_m) / 2 for cell in self.cells
         )
 
-    def scene_at(self, position_m: Array) -> int | None:
-        """Return the index of the scene whose cell contains an atlas position (3,), or None."""
-        for i, cell in enumerate(self.cells):
-            if cell.distance_m(position_m) <= cell.side_m / 2:
-                return i
-        return None
-
 
 def camera_clusters(positions_m: Array, count: int, seed: int) -> Array:
     """Return (k, 3) k-means of camera positions (n, 3); k is at most the distinct positions."""

@@ -11,15 +11,12 @@ from torch.nn import functional as F
 
 from evercal.classes import frozen
 from evercal.continual.networks.descriptor import Descriptor, described
-from evercal.continual.networks.loss import Target, radial_factor
+from evercal.continual.networks.loss import Target
 from evercal.errors import require_numbers
 from evercal.features.encoder import Encoder
 from evercal.features.views import View, ViewOptions, augmented_view, frame_view
 from evercal.geometry.se3 import SE3
 from evercal.recordings.frame import Frame
-
-UNDISTORT_STEPS = 10
-"""Fixed-point iterations that invert the radial distortion."""
 
 
 @dataclass
@@ -70,19 +67,17 @@ class FeatureBuffer:
     """Feature rows of one scene, with poses and cameras in a side table (one entry per view).
 
     Added rows accumulate on the CPU. On first use all rows move to `device`. `scene` is an index in
-    the head. With `correctable`, one camera of unknown distortion took all frames.
+    the head.
     """
 
     def __init__(
         self,
         scene: int,
         atlas_from_base: SE3,
-        correctable: bool = False,
         device: torch.device | str = "cpu",
     ):
         self.scene = scene
         self.atlas_from_base = atlas_from_base
-        self.correctable = correctable
         self.device = torch.device(device)
         self.views = 0
         self.known: Tensor | None = None
@@ -140,25 +135,6 @@ class FeatureBuffer:
         view = self.tensors["view"].cpu()
         numbers = torch.arange(self.views + 1, dtype=view.dtype, device="cpu")
         return torch.searchsorted(view, numbers)
-
-    def correct_lens(self, correction: Tensor) -> None:
-        """Undistort the pixels and correct the intrinsics; see `reprojection_error`."""
-        tensors = self.tensors
-        view = tensors["view"].long()
-        focal, dx, dy, k1, k2 = correction.to(tensors["pixels"]).unbind()
-        nominal_focals = tensors["intrinsics"][:, :2]
-        nominal_centres = tensors["intrinsics"][:, 2:]
-        focals = nominal_focals * (1 + focal)
-        centres = nominal_centres + nominal_focals * torch.stack([dx, dy])
-        distorted = (tensors["pixels"] - centres[view]) / focals[view]
-        plane = distorted
-        for _ in range(UNDISTORT_STEPS):
-            plane = distorted / radial_factor(plane, k1, k2)
-        corrected = {
-            "pixels": plane * focals[view] + centres[view],
-            "intrinsics": torch.cat([focals, centres], -1),
-        }
-        self._replace(tensors | corrected)
 
     def draw(self, count: int, generator: Generator) -> Rows:
         """Draw `count` random rows with replacement, equal on every device."""

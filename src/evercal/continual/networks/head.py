@@ -29,6 +29,8 @@ SCALE_MIN = 0.01
 """GLACE's s_min: the reciprocal of the largest homogeneous coordinate (no unit)."""
 WHITENING = 0.5
 """Strength of the input whitening, from 0 (none) to 1 (fully decorrelated)."""
+NEW_LOGIT = -10.0
+"""Logit of a centre that joins the softmax of earlier scenes, before it is trained."""
 PER_CENTRE = ("logit", "logit_bias", "offset", "offset_bias")
 """Parameters with a row for each centre; with shared offsets only the first two."""
 
@@ -211,8 +213,9 @@ class Head(nn.Module):
     def grow(self, centres: Tensor, seed: int) -> None:
         """Add a scene with k >= 0 centres (k, 3) in the atlas, metres.
 
-        Outputs for earlier scenes do not change. New rows are drawn on the CPU, so they are equal
-        on every device.
+        Outputs for earlier scenes do not change: their softmax leaves new centres out (`code`), or
+        gives them next to nothing (`descriptor`, see `NEW_LOGIT`). New rows are drawn on the CPU,
+        so they are equal on every device.
         """
         generator = torch.Generator().manual_seed(seed)
         width = self.options.width
@@ -224,8 +227,13 @@ class Head(nn.Module):
 
         bound = 1 / math.sqrt(width)
         self.code = _append(self.code, draw(1, self.layers, width, scale=0.2))
-        self.logit = _append(self.logit, draw(count, width, scale=bound))
-        self.logit_bias = _append(self.logit_bias, self.logit_bias.new_zeros(count))
+        logit = draw(count, width, scale=bound)
+        bias = torch.zeros(count)
+        if self.options.condition == "descriptor" and len(self.centres):
+            logit *= 0
+            bias += NEW_LOGIT
+        self.logit = _append(self.logit, logit)
+        self.logit_bias = _append(self.logit_bias, bias)
         if self.options.offsets == "per_centre":
             self.offset = _append(self.offset, draw(count, 4, width, scale=bound))
             self.offset_bias = _append(

@@ -20,8 +20,6 @@ FIXED_CLAMP_PX = 5.0
 """Soft clamp of losses that are compared between steps, pixels."""
 SURFACE_PX = 5.0
 """Minimum scale of the loss on known points, pixels: about the error of swept depths."""
-MAX_RADIUS2 = 1.0
-"""Squared radius in the normalised image plane beyond which the distortion is constant."""
 
 
 @frozen
@@ -75,32 +73,13 @@ def clamp_px(options: LossOptions, progress: float) -> float:
     return start * (1.0 - q) + end
 
 
-def reprojection_error(
-    points: Tensor, target: Target, correction: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Project points (n, 3) of the atlas: signed residuals (n, 2), pixels, and camera coordinates.
-
-    A correction (n, 5) of the nominal pinhole camera is the relative focal length, the shift of the
-    principal point in focal lengths (x, y), and OpenCV's k1 and k2.
-    """
+def reprojection_error(points: Tensor, target: Target) -> tuple[Tensor, Tensor]:
+    """Project points (n, 3) of the atlas: residuals (n, 2), pixels, and camera coordinates."""
     in_camera = _in_camera(points, target)
     depth = in_camera[:, 2:].clamp(min=MIN_DEPTH_M)
     plane = in_camera[:, :2] / depth
-    if correction is not None:
-        focal, dx, dy, k1, k2 = correction.split(1, dim=1)
-        radial = radial_factor(plane, k1, k2)
-        plane = plane * radial * (1.0 + focal) + torch.cat([dx, dy], 1)
     projected = plane * target.focals + target.centres
     return projected - target.pixels, in_camera
-
-
-def radial_factor(plane: Tensor, k1: Tensor, k2: Tensor) -> Tensor:
-    """Radial distortion (n, 1) at points (n, 2) of the image plane, OpenCV's 1 + k1 r^2 + k2 r^4.
-
-    Beyond `MAX_RADIUS2` the polynomial is not valid, and the factor is constant.
-    """
-    radius2 = (plane * plane).sum(-1, keepdim=True).clamp(max=MAX_RADIUS2)
-    return 1.0 + k1 * radius2 + k2 * radius2 * radius2
 
 
 def _in_camera(points: Tensor, target: Target) -> Tensor:
@@ -121,7 +100,6 @@ def reprojection_loss(
     target: Target,
     tau: float,
     options: LossOptions,
-    correction: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Compute the loss (n,) of every row, and its L2 error in pixels; infinite for invalid rows.
 
@@ -129,7 +107,7 @@ def reprojection_loss(
     tau tanh(e / tau). The loss of an invalid row is the L1 distance in metres to the point at the
     proxy depth on its ray. Errors have no gradient.
     """
-    residual, in_camera = reprojection_error(points, target, correction)
+    residual, in_camera = reprojection_error(points, target)
     error = residual.abs().sum(-1)
     depth = in_camera[:, 2]
     valid = (depth > MIN_DEPTH_M) & (depth < MAX_DEPTH_M) & (error < MAX_ERROR_PX)

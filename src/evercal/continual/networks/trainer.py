@@ -24,8 +24,6 @@ from evercal.errors import require_numbers
 
 INLIER_PX = 5.0
 """Reprojection error below which a row of `Progress.inlier_share` is an inlier, pixels."""
-CORRECTION_FROM_PX = 20.0
-"""Soft clamp below which the camera is corrected. Earlier errors come from the points."""
 
 
 @frozen
@@ -48,8 +46,6 @@ class FitOptions:
     """Decoupled weight decay, relative to the rate; not applied to codes and logits."""
     diffusion: float = 0.1
     """Standard deviation of the noise on each row's descriptor (GLACE's feature diffusion)."""
-    intrinsics_rate: float = 0.3
-    """Rate of the correction of a pinhole camera, as a share of the head's; 0 for none."""
     surface_weight: float = 0.0
     """Weight of the distance to points from depths; with 0, no depths are estimated."""
     loss: LossOptions = field(default_factory=LossOptions)
@@ -107,12 +103,7 @@ class HeadTrainer:
         self.seed = seed
         self.step = 0
         self.hooks = hooks or TrainingHooks()
-        correction = torch.zeros(len(buffers), 5, device=head.device)
-        self.correction = torch.nn.Parameter(correction)
-        self._correctable = torch.zeros(len(buffers), 1, device=head.device)
-        for i, buffer in enumerate(buffers):
-            self._correctable[i] = float(buffer.correctable)
-        self._optimisers = _optimisers(head, self.correction, options)
+        self._optimisers = _optimisers(head, options)
 
     def run(self) -> Iterator[Progress]:
         """Train to the end, yielding after every step."""
@@ -175,14 +166,7 @@ class HeadTrainer:
         self, points: Tensor, rows: Rows, tau_px: float
     ) -> tuple[Tensor, Tensor]:
         options = self.options
-        correction = None
-        if options.intrinsics_rate > 0 and tau_px < CORRECTION_FROM_PX:
-            share = len(points) // len(self.buffers)
-            of_buffers = self.correction * self._correctable
-            correction = of_buffers.repeat_interleave(share, 0)
-        costs, errors = reprojection_loss(
-            points, rows.target, tau_px, options.loss, correction
-        )
+        costs, errors = reprojection_loss(points, rows.target, tau_px, options.loss)
         if rows.known is not None:
             surface = surface_loss(points, rows.known, rows.target, tau_px)
             costs = costs + options.surface_weight * surface
@@ -223,9 +207,7 @@ class HeadTrainer:
             optimiser.step()
 
 
-def _optimisers(
-    head: Head, correction: torch.nn.Parameter, options: FitOptions
-) -> list[torch.optim.Optimizer]:
+def _optimisers(head: Head, options: FitOptions) -> list[torch.optim.Optimizer]:
     hidden = []
     decay = []
     plain = []
@@ -241,7 +223,6 @@ def _optimisers(
     groups = [
         {"params": decay, "share": 1.0},
         {"params": plain, "share": 1.0, "weight_decay": 0.0},
-        {"params": [correction], "share": options.intrinsics_rate, "weight_decay": 0.0},
     ]
     adamw = torch.optim.AdamW(groups, lr=rate, weight_decay=weight_decay, fused=True)
     if not hidden:

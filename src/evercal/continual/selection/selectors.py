@@ -164,4 +164,4 @@ SELECTORS: dict[str, Select] = {
     "sars": _sars,
     "sars_filled": partial(_sars, fill=True),
 }
-"""`sars` uses the paper's fixed radius, `sars_filled` the largest radius that fills the memory."""
+"""`sars` uses the paper's fixed radius, `sars_filled` a radius that fills the memory."""
