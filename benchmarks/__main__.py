@@ -74,6 +74,7 @@ VERBS = {
     "mutants": ("mutants", "small changes of the code that the tests should notice"),
     "networks": ("networks", "the experiments on networks; the paper's table on a GPU"),
     "wheels": ("wheels", "what lacks wheels on the platforms of docs/install.md"),
+    "depth-poses": ("depth_poses", "poses of 7-Scenes, of the depth or colour camera"),
     "layouts": ("layouts", "7-Scenes and 12-Scenes as published, with other images"),
     "verify": ("verify", "calibrations that err as stated, or more"),
     "fast-dds": ("fast_dds", "ROS 2 topics between evercal and Fast DDS"),

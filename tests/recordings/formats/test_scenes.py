@@ -148,7 +148,7 @@ SEVEN = [
     ("TestSplit.txt", None, r"TestSplit\.txt: split file is missing"),
     ("TestSplit.txt", b"office", r"TestSplit\.txt.*'office'"),
     ("TestSplit.txt", b"sequence9", r"TestSplit\.txt.*seq-09"),
-    ("TestSplit.txt", b"sequence1", "seq-01 is in both"),
+    ("TestSplit.txt", b"sequence1", "seq-01 comes twice in TrainSplit.txt and Test"),
     ("TestSplit.txt", b"\x89PNG\r\n\x1a\n", r"TestSplit\.txt: .*not a text file"),
     ("*Split.txt", b"\n", "are empty"),
     ("seq-02/*.png", None, "seq-02: no images"),

@@ -53,31 +53,27 @@ def detect(root: Path) -> bool:
 
 def load(root: Path, options: ReadOptions) -> Recording:
     """Read split files and poses, and the size of one image; no other image is opened."""
-    train_folders, test_folders = (_sequences(root, name) for name in _SPLITS)
-    shared = {*train_folders}.intersection(test_folders)
-    if shared:
+    folders: list[Path] = []
+    splits: list[list[Path]] = []
+    for name in _SPLITS:
+        images: list[Path] = []
+        for folder in _sequences(root, name):
+            if folder in folders:
+                raise InputError(
+                    f"{root}: {folder.name} comes twice in {' and '.join(_SPLITS)}; keep one"
+                )
+            folders.append(folder)
+            images += colour_images(folder)
+        splits.append(images)
+    if not folders:
         raise InputError(
-            f"{root}: {min(shared).name} is in both {_SPLITS[0]} and {_SPLITS[1]}; keep one"
+            f"{root}: {' and '.join(_SPLITS)} are empty; name a sequence in one"
         )
-    train_images = _images(train_folders)
-    test_images = _images(test_folders)
-    images = train_images + test_images
-    if not images:
-        raise InputError(
-            f"{root}: {_SPLITS[0]} and {_SPLITS[1]} are empty; name a sequence in one"
-        )
-    camera = _camera(root, images)
+    camera = _camera(root, splits[0] + splits[1])
     stated_from_camera = SE3.identity()
     if options.depth_poses:
         stated_from_camera = COLOUR_FROM_DEPTH.inverse()
-    train = tracked_frames(train_images, camera, stated_from_camera)
-    test = tracked_frames(test_images, camera, stated_from_camera)
-    untracked = len(images) - len(train) - len(test)
-    return Recording(root.resolve().name, train, test, untracked)
-
-
-def _images(folders: Sequence[Path]) -> list[Path]:
-    return [image for folder in folders for image in colour_images(folder)]
+    return tracked_recording(root, splits, camera, stated_from_camera)
 
 
 def _sequences(root: Path, split: str) -> list[Path]:
@@ -127,13 +123,25 @@ def _frame_name(image: str) -> str:
     return image[: image.rindex(".color.")]
 
 
-def tracked_frames(
-    images: Sequence[Path], camera: Camera, stated_from_camera: SE3 | None = None
-) -> tuple[Frame, ...]:
-    """Build frames from images and the pose files beside them, and drop poses with inf or nan.
+def tracked_recording(
+    root: Path,
+    splits: Sequence[Sequence[Path]],
+    camera: Camera,
+    stated_from_camera: SE3 | None = None,
+) -> Recording:
+    """A recording of training and test images, and of the pose files beside them.
 
-    With `stated_from_camera`, names of frames begin with the name of the folder.
+    Poses with inf or nan are dropped and counted. With `stated_from_camera`, names of frames begin
+    with the name of the folder.
     """
+    train, test = (_tracked(images, camera, stated_from_camera) for images in splits)
+    untracked = sum(map(len, splits)) - len(train) - len(test)
+    return Recording(root.resolve().name, train, test, untracked)
+
+
+def _tracked(
+    images: Sequence[Path], camera: Camera, stated_from_camera: SE3 | None
+) -> tuple[Frame, ...]:
     frames = []
     for image in images:
         name = _frame_name(image.name)

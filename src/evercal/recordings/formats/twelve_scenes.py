@@ -10,7 +10,7 @@ from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.recordings.formats.seven_scenes import colour_images, tracked_frames
+from evercal.recordings.formats.seven_scenes import colour_images, tracked_recording
 from evercal.recordings.frame import Recording
 from evercal.recordings.images import first_size
 from evercal.storage.text_files import library_errors, read_text
@@ -27,10 +27,7 @@ def load(root: Path) -> Recording:
     images = colour_images(root / "data")
     split = _test_count(root, len(images))
     camera = _camera(root, images)
-    train = tracked_frames(images[split:], camera)
-    test = tracked_frames(images[:split], camera)
-    untracked = len(images) - len(train) - len(test)
-    return Recording(root.resolve().name, train, test, untracked)
+    return tracked_recording(root, (images[split:], images[:split]), camera)
 
 
 def _test_count(root: Path, frames: int) -> int:
