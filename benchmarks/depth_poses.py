@@ -79,7 +79,7 @@ def _pairs(
 
 def _matches(first: Frame, second: Frame) -> np.ndarray:
     """(n, 2, 2) pixels in both images, by SIFT and a fundamental matrix of their own."""
-    sift = cv2.SIFT_create(1500)
+    sift = cv2.SIFT.create(1500)
     points, descriptors = [], []
     for frame in (first, second):
         grey = cv2.cvtColor(frame.read_image(), cv2.COLOR_RGB2GRAY)
