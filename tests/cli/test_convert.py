@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks import layouts
 from evercal.cli.args import Reading
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings import (
@@ -15,6 +16,7 @@ from evercal.recordings import (
     load_recording,
     write_image,
 )
+from evercal.recordings.samples import sample_rooms
 
 
 @pytest.fixture
@@ -72,6 +74,20 @@ def test_next_command_repeats_the_reading_options(run, wave):
     assert "note: images and poses were paired in order" in ran.out
     last = ran.out.splitlines()[-1]
     assert last == f"next: evercal learn MAP {wave} --camera {camera} --every 2"
+
+
+def test_poses_of_the_depth_camera_are_converted(run, tmp_path):
+    room = sample_rooms()[0].scene
+    scene = layouts.FakedScene(room, layouts.SEVEN_CAMERA, 0)
+    layouts.write_seven(tmp_path, "heads", scene, 2)
+    heads = tmp_path / "7scenes/heads"
+    ran = run("convert", heads, tmp_path / "out", "--depth-poses")
+    assert "1 training and 2 test frames" in ran.out
+    pose = load_recording(tmp_path / "out").train[0].base_from_camera
+    assert pose is not None
+    truth = room.train[0].base_from_camera
+    assert truth is not None
+    assert max(pose_distance(pose, truth)) < 1e-6
 
 
 def test_options_are_those_of_load_recording(run):

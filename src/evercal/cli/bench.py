@@ -127,6 +127,8 @@ class Bench(args.Verb, Training):
                 f"suite {self.suite}: give scene folders for the suite custom only"
             )
         if self.suite == "custom":
+            if self.poses != "original":
+                raise InputError("suite custom: --poses is for i7s and i12s")
             return list(map(load_recording, self.recordings))
         return load_suite(self.suite, self.data, _words(self.scenes), self.poses)
 
