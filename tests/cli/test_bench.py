@@ -38,9 +38,9 @@ def test_bench_and_its_tables(run, small, arcs, tmp_path):
     assert "BWT (backward transfer): mean change" in first.out
     again = run("bench", *words, "--out", tmp_path / "out", "--json")
     assert again.code == 0
-    (summary,) = again.json["strategies"]["evercal"]
-    assert summary["scenes"] == ["one", "two"]
-    assert summary["accuracy_5cm_5deg"][0][1] is None
+    scores = again.json["runs"]
+    assert [run["strategy"] for run in scores] == ["evercal", "finetune"]
+    assert scores[0]["final %"] == 100.0
     printed = run("bench", tmp_path / "out", "--strategies finetune")
     assert printed.code == 0
     assert "finetune - evercal" in printed.out

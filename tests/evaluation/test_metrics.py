@@ -111,6 +111,31 @@ def test_continual_scores_by_hand():
     assert continual_scores(accuracies).to_dict() == pytest.approx(expected)
 
 
+def test_continual_scores_match_a_literal_loop():
+    """Random accuracies of up to twelve scenes; each score as its formula is written."""
+    generator = np.random.default_rng(5)
+    for scenes in [*range(2, 13)] * 5:
+        a = generator.uniform(0, 100, (scenes, scenes))
+        drops, drops_before, changes, along = [], [], [], []
+        for j in range(scenes - 1):
+            accuracies = [a[i, j] for i in range(j, scenes)]
+            drops.append(max(accuracies) - accuracies[-1])
+            drops_before.append(max(accuracies[:-1]) - accuracies[-1])
+            changes.append(accuracies[-1] - accuracies[0])
+        for i in range(scenes):
+            along += [a[i, j] for j in range(i + 1)]
+        assert continual_scores(a).to_dict() == pytest.approx(
+            {
+                "final_accuracy": sum(a[-1]) / scenes,
+                "total_forgetting": sum(drops) / (scenes - 1),
+                "forgetting": sum(drops_before) / (scenes - 1),
+                "backward_transfer": sum(changes) / (scenes - 1),
+                "last_scene_accuracy": a[-1, -1],
+                "accuracy_along": sum(along) / len(along),
+            }
+        )
+
+
 def test_kinds_of_forgetting_differ_only_if_the_end_is_best():
     generator = np.random.default_rng(2)
     for _ in range(50):

@@ -99,11 +99,11 @@ class Bench(args.Verb, Training):
         from evercal.continual.benchmark import report
         from evercal.continual.benchmark.comparison import LEGEND
 
-        text, summary = report.write_report(
+        text, scores = report.write_report(
             folder, reference or _words(self.strategies)[0]
         )
         wrote = f"wrote {folder / report.TABLES}, {report.LATEX} and figures"
-        record = {"strategies": summary}
+        record = {"runs": scores}
         self.answer(record, f"{text}\n\n{LEGEND}", wrote, then=("bench", folder))
         return 0
 

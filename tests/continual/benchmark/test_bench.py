@@ -15,7 +15,6 @@ import pytest
 
 from evercal.continual import threshold
 from evercal.continual.benchmark.bench import (
-    ACCEPTANCE,
     BenchOptions,
     CompletedStage,
     begin_bench,
@@ -191,10 +190,6 @@ def test_results_of_another_law_of_acceptance_are_refused(
     monkeypatch.setattr(acceptance, constant, value)
     with pytest.raises(InputError, match="other settings: acceptance"):
         begin_bench(arcs, options, tmp_path)
-
-
-def test_settings_name_every_constant_of_acceptance() -> None:
-    assert set(ACCEPTANCE) == {name for name in vars(acceptance) if name.isupper()}
 
 
 @pytest.mark.parametrize("stages", [0, 1, 2])

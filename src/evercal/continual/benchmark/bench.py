@@ -42,18 +42,6 @@ from evercal.storage import sha256_file, write_json
 from evercal.storage.settings import lock_settings
 from evercal.typing import JsonObject
 
-ACCEPTANCE = (
-    "CHANCE",
-    "SAME_SURFACE",
-    "FALSE_ACCEPTS",
-    "FULL_SUPPORT",
-    "USELESS_M",
-    "APART_SIGMAS",
-    "APART_M",
-    "APART_RAD",
-)
-"""Constants of `localization.acceptance` that decide which poses are answers."""
-
 
 @frozen
 class CompletedStage:
@@ -169,7 +157,9 @@ def _settings(scenes: Sequence[Recording], options: BenchOptions) -> JsonObject:
         "networks": [sha256_file(file)[:12] for file in networks],
         "localize": asdict(LocalizeOptions()),
         "localize_networks": asdict(NETWORK_LOCALIZE),
-        "acceptance": {name: getattr(acceptance, name) for name in ACCEPTANCE},
+        "acceptance": {
+            name: value for name, value in vars(acceptance).items() if name.isupper()
+        },
         "order": options.order,
         "short_side": options.short_side,
         "scenes": [[scene.name, len(scene.train), len(scene.test)] for scene in scenes],

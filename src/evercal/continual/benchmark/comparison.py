@@ -1,7 +1,7 @@
 """Comparison of strategies: scores of every run, and tables with one row per strategy."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
@@ -10,7 +10,7 @@ from evercal.classes import frozen
 from evercal.continual.benchmark.results import Table
 from evercal.errors import InputError
 from evercal.evaluation.metrics import ContinualScores, continual_scores
-from evercal.typing import JsonObject, Pair
+from evercal.typing import Pair
 
 FINAL = "final %"
 """Column of `run_scores`: accuracy after the last stage."""
@@ -76,18 +76,10 @@ def run_scores(results: Table, suite: str = "") -> Table:
 
     Forgetting and memory of joint training are NaN.
     """
-    scores = {}
-    for name, seed, run in _runs(results):
-        scores[name, seed] = _scores(run, suite)
+    runs = complete_runs(results).groupby(["strategy", "seed"], sort=False)
+    scores = {key: _scores(run, suite) for key, run in runs}
     table = pd.DataFrame.from_dict(scores, orient="index")
     return table.rename_axis(["strategy", "seed"])
-
-
-def _runs(results: Table) -> Iterator[tuple[str, int, Table]]:
-    """Strategy, seed and rows of every complete run."""
-    complete = complete_runs(results)
-    for (name, seed), run in complete.groupby(["strategy", "seed"], sort=False):
-        yield str(name), int(seed), run
 
 
 def last_stage(results: Table) -> Table:
@@ -123,13 +115,8 @@ def _scores(run: Table, suite: str) -> dict[str, float]:
         "in 95 % ellipsoid": inside,
         "memory MB": memory_mb,
         "heads MB": last["head_bytes"].iloc[0] / 1e6,
-        "s": _seconds(run),
+        "s": float(run.groupby("stage")["seconds"].last().sum()),
     }
-
-
-def _seconds(run: Table) -> float:
-    """Seconds of learning, all stages."""
-    return float(run.groupby("stage")["seconds"].last().sum())
 
 
 def matrix(run: Table, threshold: Threshold) -> Table:
@@ -174,50 +161,23 @@ def finals(scores: Table) -> list[str]:
     return [name for name in scores if name.startswith(FINAL)]
 
 
-def scene_table(results: Table, suite: str = "") -> Table:
-    """Tabulate the accuracy of each scene: just after learning it -> at the end, means of runs."""
-    runs = []
-    for name, _, run in _runs(results):
-        accuracies = matrix(run, thresholds(suite)[0])
-        columns = {
-            "strategy": name,
-            "scene": accuracies.columns,
-            "learned": np.diag(accuracies),
-            "end": accuracies.iloc[-1].to_numpy(),
-        }
-        runs.append(pd.DataFrame(columns))
-    means = pd.concat(runs).groupby(["strategy", "scene"], sort=False).mean()
-    text = formatted(means)
-    return (text["learned"] + " -> " + text["end"]).unstack(sort=False)
-
-
 def contrast_table(scores: Table, pairs: Sequence[tuple[str, str]]) -> Table:
     """Tabulate differences of pairs of strategies on common seeds, in points; see `run_scores`.
 
     Final accuracies and area, each with the ends of `seeds_interval`, which hold for all pairs
     together, and the number of runs in which the first strategy is better.
     """
-    columns = [*finals(scores), AREA]
-    by_name = dict(list(scores[columns].groupby(level="strategy")))
-    none = scores[:0][columns]
+    names = {name for pair in pairs for name in pair}
     rows = []
-    for score in columns:
+    for score in (*finals(scores), AREA):
+        by_seed = scores[score].unstack("seed").reindex(sorted(names))
         for ours, theirs in pairs:
-            first = by_name.get(ours, none).droplevel("strategy")
-            second = by_name.get(theirs, none).droplevel("strategy")
-            gains = (first - second)[score].dropna()
+            gains = (by_seed.loc[ours] - by_seed.loc[theirs]).dropna()
             low, high = seeds_interval(gains, len(pairs))
-            rows.append(
-                {
-                    "score": score,
-                    "contrast": f"{ours} - {theirs}",
-                    "runs": len(gains),
-                    "points": gains.mean(),
-                    "low": low,
-                    "high": high,
-                    "better in": (gains > 0).sum(),
-                }
-            )
+            row = {"score": score, "contrast": f"{ours} - {theirs}"}
+            ends = {"points": gains.mean(), "low": low, "high": high}
+            counts = {"runs": len(gains), "better in": (gains > 0).sum()}
+            rows.append(row | ends | counts)
     table = pd.DataFrame(rows)
     if rows:
         signed = ["points", "low", "high"]
@@ -259,34 +219,3 @@ def seeds_interval(values: Sequence[float], comparisons: int = 1) -> Pair:
 def formatted(table: Table, number: str = "{:.1f}") -> Table:
     """Format numbers, by default with one digit; NaN becomes `-`."""
     return table.map(number.format).where(table.notna(), "-")
-
-
-def summary(results: Table, suite: str = "") -> dict[str, list[JsonObject]]:
-    """Summarize every complete run for JSON, by strategy; NaN becomes None.
-
-    Forgetting is at the threshold of the suite.
-    """
-    strategies = {}
-    threshold, _ = thresholds(suite)
-    for name, seed, run in _runs(results):
-        last = last_stage(run).iloc[0]
-        judged = matrix(run, threshold)
-        strategies.setdefault(name, []).append(
-            {
-                "seed": seed,
-                "scenes": list(judged.columns),
-                "threshold": threshold.text,
-                "accuracy_5cm_5deg": _plain(matrix(run, _COARSE)),
-                "accuracy_1cm_1deg": _plain(matrix(run, _FINE)),
-                **continual(judged).to_dict(),
-                "memory_bytes": int(last["memory_bytes"]),
-                "head_bytes": int(last["head_bytes"]),
-                "seconds": _seconds(run),
-            }
-        )
-    return strategies
-
-
-def _plain(accuracies: Table) -> list[list[float | None]]:
-    values = accuracies.round(3).astype(object)
-    return values.where(accuracies.notna(), None).to_numpy().tolist()

@@ -29,8 +29,8 @@ COLOURS = (
 """Colours of lines."""
 _MARKERS = "os^Dv<>P"
 """Markers of lines."""
-_LINES = ("-", "--", "-.", ":")
-"""Dashes of lines."""
+_DASHES = ("-", "--", "-.", ":")
+"""Dashes of lines whose colours repeat."""
 _HATCHES = ("", "///", "...", "xxx")
 """Patterns of bars whose colours repeat."""
 _SIDE_BY_SIDE = 4
@@ -84,56 +84,50 @@ def draw_figures(
     places = scenes
     if len(orders) > 1:
         places = [f"scene {i + 1}" for i in range(len(scenes) - 1)] + [_MEAN]
-    over_stages = _Panels(places, threshold)
-    final = _Panels(scenes, threshold)
+    stages = range(1, len(scenes))
+    over_stages, panels = _panels(places, threshold)
+    over_stages.supxlabel("scenes learned", fontsize=9)
+    final, bar_panels = _panels(scenes, threshold)
     for index, name in enumerate(strategies):
         style: JsonObject = {"color": COLOURS[index % len(COLOURS)], "label": name}
-        turned = index + index // len(COLOURS)
-        drawn = {
-            "marker": _MARKERS[turned % len(_MARKERS)],
-            "linestyle": _LINES[turned % len(_LINES)],
-            "markersize": 3.5,
-        }
-        stages = np.arange(1, len(scenes))
-        for panel, values in zip(over_stages.panels, lines[name].T, strict=True):
-            panel.plot(stages, values, **style, **drawn)
-        hatch = _HATCHES[index // len(COLOURS) % len(_HATCHES)]
-        for panel, scene in zip(final.panels, scenes, strict=True):
+        again = index // len(COLOURS)
+        dashes = _DASHES[again % len(_DASHES)]
+        marker = _MARKERS[index % len(_MARKERS)]
+        for panel, values in zip(panels, lines[name].T, strict=True):
+            panel.plot(stages, values, dashes, marker=marker, markersize=3.5, **style)
+            panel.set_xticks(stages)
+        hatch = _HATCHES[again % len(_HATCHES)]
+        for panel, scene in zip(bar_panels, scenes, strict=True):
             height = bars[name][scene]
-            panel.bar(index, height, **style, hatch=hatch, edgecolor="white")
-    over_stages.save(folder / LINES, "scenes learned", range(1, len(scenes)))
-    final.save(folder / BARS, "", ())
+            panel.bar(index, height, hatch=hatch, edgecolor="white", **style)
+            panel.set_xticks([])
+    _save(over_stages, panels[0], folder / LINES)
+    _save(final, bar_panels[0], folder / BARS)
 
 
-class _Panels:
-    """Panels in rows, with a common axis of accuracy and a legend."""
+def _panels(titles: Sequence[str], threshold: Threshold) -> tuple[Figure, list[Axes]]:
+    """Panels in rows, with a common axis of accuracy."""
+    rows = -(-len(titles) // _SIDE_BY_SIDE)
+    columns = min(len(titles), _SIDE_BY_SIDE)
+    figure = new_figure(2.6 * columns, 0.6 + 2.2 * rows)
+    figure.supylabel(f"accuracy at {threshold.text} (%)", fontsize=9)
+    panels = []
+    for number, title in enumerate(titles, start=1):
+        panel = figure.add_subplot(rows, columns, number, ylim=(-3, 103))
+        panel.set_title(title, fontsize=9)
+        tidy(panel)
+        panels.append(panel)
+    return figure, panels
 
-    def __init__(self, titles: Sequence[str], threshold: Threshold):
-        rows = -(-len(titles) // _SIDE_BY_SIDE)
-        columns = min(len(titles), _SIDE_BY_SIDE)
-        self.figure = new_figure(2.6 * columns, 0.6 + 2.2 * rows)
-        panels = self.figure.subplots(rows, columns, sharey=True, squeeze=False)
-        self.panels = panels.ravel()[: len(titles)]
-        for spare in panels.ravel()[len(titles) :]:
-            spare.remove()
-        for panel, title in zip(self.panels, titles, strict=True):
-            panel.set_title(title, fontsize=9)
-            panel.set_ylim(-3, 103)
-            tidy(panel)
-        self.figure.supylabel(f"accuracy at {threshold.text} (%)", fontsize=9)
 
-    def save(self, path: Path, across: str, ticks: Sequence[int]) -> None:
-        """Add the legend and write the file; `across` is the common label of the other axis."""
-        for panel in self.panels:
-            panel.set_xticks(ticks)
-        self.figure.supxlabel(across, fontsize=9)
-        handles, labels = self.panels[0].get_legend_handles_labels()
-        self.figure.legend(
-            handles,
-            labels,
-            loc="outside upper center",
-            ncols=5,
-            frameon=False,
-            fontsize=8,
-        )
-        self.figure.savefig(path)
+def _save(figure: Figure, panel: Axes, path: Path) -> None:
+    handles, labels = panel.get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        loc="outside upper center",
+        ncols=5,
+        frameon=False,
+        fontsize=8,
+    )
+    figure.savefig(path)

@@ -38,49 +38,45 @@ _ORANGE = (255, 150, 0)
 """Colour of contours, RGB."""
 
 
-def record_overlays(
-    folder: Path,
-    strategy: str,
-    scenes: Sequence[Recording],
-    results: Sequence[FrameResult],
+def record_overlay(
+    folder: Path, strategy: str, scene: Recording, results: Sequence[FrameResult]
 ) -> None:
-    """Draw the pictures of a complete run that the folder of results lacks."""
-    for scene in scenes:
-        path = folder / _FOLDER / scene.name / f"{strategy}.png"
-        if path.exists():
-            continue
-        of_scene = [result for result in results if result.scene == scene.name]
-        middle = len(of_scene) // 2
-        picture = _picture(scene, middle, of_scene[middle])
+    """Draw the picture of a scene by a complete run, unless the folder of results has it.
+
+    `results` are those of the test frames of the scene.
+    """
+    path = folder / _FOLDER / scene.name / f"{strategy}.png"
+    if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, picture)
+        write_image(path, _picture(scene, results[len(results) // 2]))
 
 
-def _picture(scene: Recording, number: int, result: FrameResult) -> Image:
-    """A test image in grey, its contours by the estimated pose, and the errors below."""
+def _picture(scene: Recording, result: FrameResult) -> Image:
+    """The test image in grey, its contours by the estimated pose, and the errors below."""
     import cv2
 
-    grey, camera, points = _contours(scene, number)
+    grey, camera, points = _contours(scene)
     drawn = cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB)
     row = frame_row(result)
     text = row["outcome"]
     if result.estimated and np.isfinite(row["error_mm"]):
         text = f"{row['error_mm']:.0f} mm, {row['error_deg']:.1f} deg"
         pixels = camera.project(result.estimated.inverse().apply(points))
-        inside = ((pixels > 0) & (pixels < np.array(camera.size) - 1)).all(1)
-        columns, rows = pixels[inside].round().astype(int).T
-        drawn[rows, columns] = _ORANGE
-    line = np.full((24, camera.width, 3), 255, np.uint8)
-    cv2.putText(line, text, (4, 17), 0, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
-    return np.concatenate([drawn, line], dtype=np.uint8)
+        for pixel in np.nan_to_num(pixels, nan=-1).clip(-1, 9999).round().astype(int):
+            cv2.circle(drawn, pixel.tolist(), 0, _ORANGE)
+    drawn[-20:] = 255
+    place = (4, len(drawn) - 5)
+    cv2.putText(drawn, text, place, 0, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+    return np.asarray(drawn, np.uint8)
 
 
 @cache
-def _contours(scene: Recording, number: int) -> tuple[Image, Camera, Array]:
+def _contours(scene: Recording) -> tuple[Image, Camera, Array]:
     """The image in grey, its camera, and points (n, 3) of its contours in the base frame."""
     import cv2
 
-    frame = posed_frames(scene.test)[number]
+    tests = posed_frames(scene.test)
+    frame = tests[len(tests) // 2]
     train = posed_frames(scene.train)
     pose = frame.base_from_camera
     assert pose, "posed frames only"
@@ -90,12 +86,10 @@ def _contours(scene: Recording, number: int) -> tuple[Image, Camera, Array]:
     depths = frame_depths(frames, load_encoder(), _SHORT_SIDE)[0]
     short_side = min(_SHORT_SIDE, *frame.camera.size)
     grey, camera = working_image(frame.read_image(), frame.camera, short_side)
-    nearest_depth = cv2.resize(
-        depths, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST
-    )
     rows, columns = np.nonzero(cv2.Canny(grey, *_EDGES))
-    rays = camera.unproject(np.column_stack([columns, rows]))
-    points = rays * nearest_depth[rows, columns, None]
+    height, width = depths.shape
+    known = depths[rows * height // camera.height, columns * width // camera.width]
+    points = camera.unproject(np.column_stack([columns, rows])) * known[:, None]
     return grey, camera, pose.apply(points[np.isfinite(points).all(1)])
 
 

@@ -4,7 +4,7 @@ Tables 1 to 3 have scenes down and strategies across. Table 4 adds SARS, then SP
 """
 
 from collections.abc import Mapping
-from math import isinf, nan
+from math import nan
 from pathlib import Path
 
 import pandas as pd
@@ -45,7 +45,7 @@ TABLE4 = (
 """Strategies of `ABLATIONS`."""
 _PUBLISHED = Path(__file__).with_name("published.csv")
 """The rows of Tables 1 to 4 of the paper, as printed."""
-_ACCURACY = "Acc, %"
+ACCURACY = "Acc, %"
 """Column of accuracy, and of TFR in its row."""
 
 
@@ -56,14 +56,6 @@ def published(suite: str) -> Table:
     if suite.startswith("sim"):
         name = "sim"
     return rows[rows["suite"] == name].drop(columns="suite")
-
-
-def published_totals(suite: str) -> Table:
-    """The paper's mean accuracy and TFR of a suite, per cent: a row per strategy."""
-    rows = published(suite)
-    totals = rows[rows["scene"].isin(["Mean", "TFR"])]
-    by_name = totals.pivot(index="strategy", columns="scene", values=_ACCURACY)
-    return by_name.reindex(columns=["Mean", "TFR"])
 
 
 def paper_table(results: Table, suite: str = "") -> Table:
@@ -78,7 +70,7 @@ def paper_table(results: Table, suite: str = "") -> Table:
         {
             "t, cm": last["median_mm"] / 10,
             "r, deg": last["median_deg"],
-            _ACCURACY: 100 * last[threshold.column] / last["frames"],
+            ACCURACY: 100 * last[threshold.column] / last["frames"],
         }
     )
     means = cells.groupby([last["scene"], last["strategy"]], sort=False).mean()
@@ -89,11 +81,11 @@ def paper_table(results: Table, suite: str = "") -> Table:
         "strategy"
     )
     forgetting = by_strategy.agg(lambda values: values.mean(skipna=False))
-    totals = {"Mean": table.xs(_ACCURACY, axis=1, level=1).mean(), "TFR": forgetting}
+    totals = {"Mean": table.xs(ACCURACY, axis=1, level=1).mean(), "TFR": forgetting}
     for title, values in totals.items():
         table.loc[title] = nan
         for name in names:
-            table.loc[title, (name, _ACCURACY)] = values[name]
+            table.loc[title, (name, ACCURACY)] = values[name]
     theirs = _side_by_side(published(suite).set_index(["scene", "strategy"]))
     theirs.index += ", published"
     table = pd.concat([table, theirs.reindex(columns=table.columns)])
@@ -113,7 +105,7 @@ def ablation_table(scores: Table, suite: str = "") -> Table:
     other threshold is beside it, and the published one if there is any.
     """
     means = scores[comparison.finals(scores)].groupby("strategy").mean()
-    theirs = published_totals(suite)["Mean"]
+    theirs = published(suite).query("scene == 'Mean'").set_index("strategy")[ACCURACY]
     rows = []
     for title, steps in ABLATIONS.items():
         if means.index.isin(dict(steps).values()).sum() < 2:
@@ -129,7 +121,7 @@ def ablation_table(scores: Table, suite: str = "") -> Table:
                 "": label,
                 **means.loc[name].map("{:.1f}".format),
                 "step": step["points"],
-                "95 %": f"{step['low']} to {step['high']}",
+                "95 %": f"{step['low']} to {step['high']}".replace("- to -", "-"),
             }
             if "sars_old_output" in theirs:  # the paper has this table for the suite
                 row["published %"] = ""
@@ -141,16 +133,10 @@ def ablation_table(scores: Table, suite: str = "") -> Table:
 
 def latex(table: Table, index: bool = True) -> str:
     """Format a table in LaTeX (needs booktabs); NaN becomes `--`."""
-
-    def text(value: float) -> str:
-        if isinf(value):
-            return r"$\infty$"
-        return f"{value:.1f}"
-
     return table.to_latex(
         index=index,
         na_rep="--",
-        float_format=text,
+        float_format="{:.1f}".format,
         escape=True,
         multicolumn_format="c",
     )

@@ -13,10 +13,10 @@ from evercal.continual.benchmark import comparison, results as stored
 from evercal.continual.benchmark.figures import BARS, LINES, draw_figures
 from evercal.continual.benchmark.overlays import OVERLAYS, draw_overlays
 from evercal.continual.benchmark.paper_tables import (
+    ACCURACY,
     ablation_table,
     latex,
     paper_table,
-    published_totals,
 )
 from evercal.errors import InputError
 from evercal.storage import write_bytes
@@ -29,13 +29,11 @@ LATEX = "tables.tex"
 """File of the paper's tables."""
 
 
-def write_report(
-    folder: Path, reference: str
-) -> tuple[str, dict[str, list[JsonObject]]]:
+def write_report(folder: Path, reference: str) -> tuple[str, list[JsonObject]]:
     """Write tables and figures of a folder of results.
 
-    All strategies are compared with `reference`. Returns the tables as Markdown, and the
-    `comparison.summary` of the runs.
+    All strategies are compared with `reference`. Returns the tables as Markdown, and the scores of
+    each run for JSON; NaN becomes None.
     """
     results = stored.read(folder)
     if results.empty:
@@ -44,13 +42,9 @@ def write_report(
     results = comparison.complete_runs(results)
     threshold, _ = comparison.thresholds(suite)
     scores = comparison.run_scores(results, suite)
-    scenes = comparison.scene_table(results, suite).reset_index()
     methods = comparison.method_table(scores)
-    theirs = published_totals(suite)
-    if len(theirs):
-        theirs = comparison.formatted(theirs.reindex(methods.index))
-        methods.insert(2, "published %", theirs["Mean"])
-        methods.insert(5, "published TFR", theirs["TFR"])
+    paper = paper_table(results, suite)
+    accuracies = comparison.formatted(paper.xs(ACCURACY, axis=1, level=1))
     ablation = ablation_table(scores, suite)
     others = methods.index.drop(reference, errors="ignore")
     pairs = [(reference, name) for name in others]
@@ -59,7 +53,9 @@ def write_report(
         contrasts = contrasts[contrasts["runs"] > 0]
     tables = {
         f"Strategies at {threshold.text}, means over runs": methods.reset_index(),
-        "Accuracy of each scene: just after learning it -> at the end": scenes,
+        "Final accuracy, as Tables 1 to 3 of the paper": accuracies.reset_index(
+            names="scene"
+        ),
         "Differences on common seeds, in points": contrasts,
         "Ablation after Table 4 of the paper": ablation,
     }
@@ -74,9 +70,10 @@ def write_report(
         figures += f"\n![contours by the estimated poses]({OVERLAYS})"
     page = f"{text}\n\n{comparison.LEGEND}\n\n{figures}\n"
     write_bytes(folder / TABLES, page.encode())
-    paper = latex(paper_table(results, suite))
+    text_of_paper = latex(paper)
     if len(ablation):
-        paper += f"\n{latex(ablation, index=False)}"
-    write_bytes(folder / LATEX, paper.encode())
+        text_of_paper += f"\n{latex(ablation, index=False)}"
+    write_bytes(folder / LATEX, text_of_paper.encode())
     draw_figures(results, methods.index, threshold, folder)
-    return text, comparison.summary(results, suite)
+    records = scores.reset_index().astype(object)
+    return text, records.where(records.notna(), None).to_dict("records")

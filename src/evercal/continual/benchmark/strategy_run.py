@@ -12,7 +12,7 @@ import pandas as pd
 from filelock import FileLock
 
 from evercal.classes import frozen
-from evercal.continual.benchmark.overlays import record_overlays
+from evercal.continual.benchmark.overlays import record_overlay
 from evercal.continual.benchmark.results import (
     StageResults,
     frame_row,
@@ -129,15 +129,14 @@ class _Run:
         run = {"strategy": self.strategy.name, "seed": self.stage.seed}
         learned = {scene.name: scene for scene in self.scenes[: number + 1]}
         evaluated = evaluate(localizer, learned)
-        for scene in learned:
-            of_scene = [frame for frame in evaluated if frame.scene == scene]
+        last = len(learned) == len(self.scenes)
+        for name, scene in learned.items():
+            of_scene = [frame for frame in evaluated if frame.scene == name]
             results.append({**run, "stage": number, **scene_row(of_scene), **costs})
-            frames += [run | frame_row(frame) for frame in of_scene]
+            if last:
+                frames += [run | frame_row(frame) for frame in of_scene]
+                record_overlay(self.out, self.strategy.name, scene, of_scene)
         table = pd.DataFrame(frames)
-        if len(learned) < len(self.scenes):
-            table = table[:0]
-        else:
-            record_overlays(self.out, self.strategy.name, self.scenes, evaluated)
         return StageResults(number, pd.DataFrame(results), table)
 
 
