@@ -32,7 +32,7 @@ def run(
     rows: list[Row] = []
     for scene in scenes:
         original = load_recording(scene)
-        colour = load_recording(scene, options=ReadOptions(depth_poses=True))
+        colour = load_recording(scene, options=ReadOptions(poses="colour"))
         converted = {frame.name: frame for frame in colour.train}
         for step in apart:
             medians = []

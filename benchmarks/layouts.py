@@ -19,7 +19,7 @@ import numpy as np
 
 from evercal.geometry import SE3, Camera
 from evercal.recordings import Frame, Recording, as_rgb, write_image
-from evercal.recordings.formats.seven_scenes import COLOUR_FROM_DEPTH
+from evercal.recordings.formats.tracked_frames import COLOUR_FROM_DEPTH
 from evercal.recordings.samples import sample_rooms
 
 SEVEN = {

@@ -81,7 +81,7 @@ def test_poses_of_the_depth_camera_are_converted(run, tmp_path):
     scene = layouts.FakedScene(room, layouts.SEVEN_CAMERA, 0)
     layouts.write_seven(tmp_path, "heads", scene, 2)
     heads = tmp_path / "7scenes/heads"
-    ran = run("convert", heads, tmp_path / "out", "--depth-poses")
+    ran = run("convert", heads, tmp_path / "out", "--poses", "colour")
     assert "1 training and 2 test frames" in ran.out
     pose = load_recording(tmp_path / "out").train[0].base_from_camera
     assert pose is not None

@@ -27,7 +27,7 @@ REFUSED = {
     "audit MAP empty --images 0": "--images is at least 1",
     "bench attic": "suite 'attic': unknown; choose one of sim-mini",
     "bench empty": "no results here",
-    "bench custom ROOM --poses colour": "suite custom: --poses is for i7s and i12s",
+    "bench custom ROOM --poses colour": "--poses: not used by recordings of format generic",
     "bench custom": "suite custom: give scene folders for the suite custom only",
     "bench sim-mini somewhere": "suite sim-mini: give scene folders for the suite custom",
     "bench sim-mini --strategies evercal,magic": "strategy 'magic': unknown; choose one of",

@@ -77,6 +77,14 @@ At = Annotated[
         " that the camera sees: its standard deviation in the base or gripper frame is stated.",
     ),
 ]
+Poses = Annotated[
+    str,
+    arg(
+        metavar="original|colour|DIR",
+        help="Poses of 7-Scenes and 12-Scenes: as published; those of the colour camera (7-Scenes);"
+        " or a folder of poses by structure from motion (Brachmann et al., ICCV 2021).",
+    ),
+]
 Address = Annotated[str | None, shown("ADDRESS")]
 Device = Annotated[
     Literal["auto", "cpu", "cuda"],
@@ -186,9 +194,7 @@ class Reading(Named):
     metres: bool = False
     """The poses of a COLMAP or nerfstudio recording are in metres. Default: their unit is unknown
     until 'evercal align'."""
-    depth_poses: bool = False
-    """The poses of a 7-Scenes recording are of its depth camera, as published; use those of the
-    colour camera."""
+    poses: Poses = "original"
     every: Number = 1
     """Use every N-th image."""
 

@@ -1,6 +1,7 @@
 """`evercal bench`."""
 
 import dataclasses
+import functools
 import itertools
 from dataclasses import field
 from pathlib import Path
@@ -50,9 +51,7 @@ class Bench(args.Verb, Training):
     """Comma-separated scenes of the suite. Defaults to all."""
     data: args.Folder = None
     """Folder of the suite's recordings, with one folder per scene."""
-    poses: Annotated[str, arg(metavar="original|colour|DIR")] = "original"
-    """Poses of i7s and i12s: the original ones, those of the colour camera (i7s), or a folder of
-    poses from structure from motion (Brachmann et al., ICCV 2021)."""
+    poses: args.Poses = "original"
     preset: Preset = field(default="bench", kw_only=True)
     """Training effort per stage; paper needs a GPU."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
@@ -120,16 +119,16 @@ class Bench(args.Verb, Training):
 
     def _recorded(self) -> "list[Recording]":
         from evercal.continual.benchmark.suites import load_suite
-        from evercal.recordings import load_recording
+        from evercal.recordings import ReadOptions, load_recording
 
         if (self.suite == "custom") != bool(self.recordings):
             raise InputError(
                 f"suite {self.suite}: give scene folders for the suite custom only"
             )
         if self.suite == "custom":
-            if self.poses != "original":
-                raise InputError("suite custom: --poses is for i7s and i12s")
-            return list(map(load_recording, self.recordings))
+            options = ReadOptions(poses=self.poses)
+            load = functools.partial(load_recording, options=options)
+            return list(map(load, self.recordings))
         return load_suite(self.suite, self.data, _words(self.scenes), self.poses)
 
     def _stage(self, seed: int) -> "StageOptions":

@@ -45,9 +45,11 @@ FORMATS: dict[FormatName, RecordingFormat] = {
     "7scenes": RecordingFormat(
         "seven_scenes",
         "TrainSplit.txt, TestSplit.txt and seq-XX folders",
-        ("depth_poses",),
+        ("poses",),
     ),
-    "12scenes": RecordingFormat("twelve_scenes", "info.txt, split.txt and data"),
+    "12scenes": RecordingFormat(
+        "twelve_scenes", "info.txt, split.txt and data", ("poses",)
+    ),
     "cambridge": RecordingFormat(
         "cambridge", "dataset_train.txt and dataset_test.txt", ("camera",)
     ),

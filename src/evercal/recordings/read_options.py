@@ -34,9 +34,9 @@ class ReadOptions:
     metres: bool = False
     """The lengths of a COLMAP or nerfstudio recording are metres. If omitted, their unit is
     unknown."""
-    depth_poses: bool = False
-    """The poses of a 7-Scenes recording are those of its depth camera, as published: take those of
-    the colour camera, as ACE and GLACE do."""
+    poses: str = "original"
+    """Poses of 7-Scenes and 12-Scenes: original; colour for those of the colour camera of 7-Scenes,
+    whose original ones are of the depth camera; or a folder of those by structure from motion."""
     whole_robot: bool = False
     """Read the values of all joints that the URDF has, as for the arm in the images, instead of
     gripper poses, which are those of the base then."""

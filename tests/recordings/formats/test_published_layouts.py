@@ -65,18 +65,25 @@ def test_poses_of_the_colour_camera_are_those_of_the_images(data: Path) -> None:
     assert stated is not None
     offset = np.linalg.norm(stated.translation_m - truth.translation_m)
     assert 0.0256 < offset < 0.0257
-    options = ReadOptions(depth_poses=True)
+    options = ReadOptions(poses="colour")
     for recording in (
         load_recording(chess, options=options),
         *load_suite("i7s", data / "7scenes", ["chess"], "colour"),
         *load_suite("i7s", data / "7scenes", ["chess"], f"{data}/pgt/sfm/7scenes"),
     ):
         assert_pose(recording.train[0].base_from_camera, truth, 1e-6)
-    message = (
-        "`depth_poses`: not used by recordings of format 12scenes, only by 7scenes"
-    )
     kitchen = data / "12scenes/apt1/kitchen"
-    refused(message, load_recording, kitchen, options=options)
+    refused("`poses` colour is for 7-Scenes", load_recording, kitchen, options=options)
+
+
+def test_frames_without_an_original_pose_may_have_one_by_sfm(data: Path) -> None:
+    poses = f"{data}/pgt/sfm/12scenes"
+    (kitchen,) = load_suite("i12s", data / "12scenes", ["apt1/kitchen"], poses)
+    names = [frame.name for frame in (*kitchen.test, *kitchen.train)]
+    assert names == [f"frame-00000{i}" for i in (0, 1, 2, 4, 5, 6)]
+    assert kitchen.untracked == 2
+    original = load_recording(data / "12scenes/apt1/kitchen")
+    assert original.train[0].name == "frame-000005"
 
 
 def test_the_published_transform_is_that_of_published_poses() -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from evercal.classes import frozen
-from evercal.continual.benchmark.sfm_poses import with_sfm_poses
 from evercal.errors import InputError
 from evercal.recordings import (
     MIN_TRAIN_FRAMES,
@@ -99,16 +98,11 @@ def load_suite(
 ) -> list[Recording]:
     """Load the scenes of a suite in order of learning, by default all.
 
-    `data` has a folder for each scene. `poses` are the original ones, for i7s also those of the
-    colour camera, see `ReadOptions.depth_poses`, and for i7s and i12s a folder of poses from
-    structure from motion (Brachmann et al., ICCV 2021).
+    `data` has a folder for each scene. `poses` of i7s and i12s are those of `ReadOptions.poses`.
     """
     if name not in SUITES:
         names = ", ".join([*SUITES, "custom"])
         raise InputError(f"suite {name!r}: unknown; choose one of {names}")
-    suites = {"original": (name,), "colour": ("i7s",)}.get(poses, ("i7s", "i12s"))
-    if name not in suites:
-        raise InputError(f"suite {name}: `poses` {poses} is for {' and '.join(suites)}")
     suite = SUITES[name]
     for scene in scenes:
         if scene not in suite.scenes:
@@ -126,14 +120,12 @@ def load_suite(
                 raise InputError(
                     f"suite {name}: {data / scene} is missing; {_remedy(data, scene, suite)}"
                 )
-    options = ReadOptions(depth_poses=poses == "colour")
+    options = ReadOptions(poses=poses)
     recordings = []
     for scene in names:
         # Names of scenes have no slashes: apt1/kitchen becomes apt1-kitchen.
         place = scene.replace("/", "-")
         recording = load_recording(data / scene, name=place, options=options)
-        if poses not in ("original", "colour"):
-            recording = with_sfm_poses(recording, Path(poses), scene.replace("/", "_"))
         recordings.append(recording)
     return recordings
 

@@ -10,9 +10,11 @@ from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
-from evercal.recordings.formats.seven_scenes import colour_images, tracked_recording
+from evercal.recordings.formats.seven_scenes import colour_images
+from evercal.recordings.formats.tracked_frames import tracked_recording
 from evercal.recordings.frame import Recording
 from evercal.recordings.images import first_size
+from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import library_errors, read_text
 
 
@@ -22,12 +24,17 @@ def detect(root: Path) -> bool:
     return sum(map(Path.exists, parts)) > 1
 
 
-def load(root: Path) -> Recording:
+def load(root: Path, options: ReadOptions) -> Recording:
     """Read split, calibration and poses, and the size of one image; no other image is opened."""
     images = colour_images(root / "data")
     split = _test_count(root, len(images))
     camera = _camera(root, images)
-    return tracked_recording(root, (images[split:], images[:split]), camera)
+    if options.poses == "colour":
+        raise InputError("`poses` colour is for 7-Scenes; here the cameras are one")
+    place = root.resolve()
+    name = f"{place.parent.name}_{place.name}"
+    splits = (images[split:], images[:split])
+    return tracked_recording(root, name, splits, camera, options.poses)
 
 
 def _test_count(root: Path, frames: int) -> int:

@@ -6,44 +6,54 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from evercal.continual.benchmark.sfm_poses import with_sfm_poses
-from evercal.errors import InputError
-from evercal.geometry import SE3, Camera
-from evercal.recordings import Frame, Recording
+from evercal.recordings import ReadOptions, Recording, load_recording, write_image
 
-CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
-IMAGE = np.zeros((480, 640, 3), np.uint8)
+from ..checks import refused
 
-
-def frame(name: str) -> Frame:
-    return Frame(name, IMAGE, CAMERA, SE3.identity())
-
-
-RECORDING = Recording(
-    "heads",
-    tuple(frame(f"seq-02/frame-00000{i}") for i in range(3)),
-    (frame("seq-01/frame-000000"),),
-    untracked=1,
-)
 # A quarter turn about y, then a metre along z: camera_from_world.
 LINE = "0.70710678 0 0.70710678 0 0 0 1 527.745"
 
 
+@pytest.fixture
+def heads(tmp_path: Path) -> Path:
+    """Three training images and a test image; the first has no original pose."""
+    root = tmp_path / "heads"
+    for sequence, count in ((1, 1), (2, 3)):
+        folder = root / f"seq-0{sequence}"
+        folder.mkdir(parents=True)
+        for i in range(count):
+            stem = folder / f"frame-{i:06d}"
+            write_image(stem.with_suffix(".color.png"), np.zeros((48, 64, 3), np.uint8))
+            np.savetxt(stem.with_suffix(".pose.txt"), np.eye(4))
+    np.savetxt(root / "seq-02/frame-000000.pose.txt", np.full((4, 4), -np.inf))
+    (root / "TrainSplit.txt").write_text("sequence2")
+    (root / "TestSplit.txt").write_text("sequence1")
+    return root
+
+
 def write(folder: Path, train: list[str], test: list[str]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / "heads_train.txt").write_text("\n".join(train) + "\n")
     (folder / "heads_test.txt").write_text("\n".join(test) + "\n")
 
 
-def test_poses_are_replaced_and_other_frames_dropped(tmp_path: Path) -> None:
-    # Any order, any extension; frames 1 is not in the reconstruction.
+def read(root: Path, folder: Path) -> Recording:
+    return load_recording(root, options=ReadOptions(poses=str(folder)))
+
+
+def test_poses_are_replaced_and_other_frames_dropped(
+    heads: Path, tmp_path: Path
+) -> None:
+    # Any order, any extension. Frame 1 is not in the reconstruction, frame 0 is in it alone.
+    assert load_recording(heads).untracked == 1
     train = [f"seq-02/frame-00000{i}.color.png {LINE}" for i in (2, 0)]
     write(tmp_path, train, [f"seq-01/frame-000000.color.png {LINE}"])
-    result = with_sfm_poses(RECORDING, tmp_path, "heads")
+    result = read(heads, tmp_path)
     assert [f.name for f in result.train] == [
         "seq-02/frame-000000",
         "seq-02/frame-000002",
     ]
-    assert result.untracked == 2
+    assert result.untracked == 1
     pose = result.test[0].base_from_camera
     assert pose is not None
     rotation = Rotation.from_euler("y", 90, degrees=True)
@@ -57,19 +67,6 @@ def test_poses_are_replaced_and_other_frames_dropped(tmp_path: Path) -> None:
     assert (camera.cx + 0.5, camera.cy + 0.5) == (camera.width / 2, camera.height / 2)
 
 
-def test_frames_of_12_scenes_have_no_sequence(tmp_path: Path) -> None:
-    recording = Recording(
-        "apt1-kitchen", (frame("frame-000357"),), (frame("frame-000001"),)
-    )
-    (tmp_path / "apt1_kitchen_train.txt").write_text(
-        f"data/frame-000357.color.jpg {LINE}\n"
-    )
-    (tmp_path / "apt1_kitchen_test.txt").write_text(
-        f"data/frame-000001.color.jpg {LINE}\n"
-    )
-    assert len(with_sfm_poses(recording, tmp_path, "apt1_kitchen").train) == 1
-
-
 @pytest.mark.parametrize(
     ("line", "message"),
     [
@@ -79,33 +76,30 @@ def test_frames_of_12_scenes_have_no_sequence(tmp_path: Path) -> None:
         ),
         ("seq-01/frame-000000.color.png 1 0 0 0 0 0 0 -5", "camera fx"),
         ("seq-01/frame-000000.color.png 0 0 0 0 0 0 0 500", "SE3 got a quaternion of"),
-        (f"seq-07/frame-000000.color.png {LINE}", "no frame of heads is in it"),
+        (f"seq-07/frame-000000.color.png {LINE}", "no frame of .*heads is in it"),
     ],
 )
-def test_broken_files_are_refused(tmp_path: Path, line: str, message: str) -> None:
+def test_broken_files_are_refused(
+    heads: Path, tmp_path: Path, line: str, message: str
+) -> None:
     write(tmp_path, [f"seq-02/frame-000000.color.png {LINE}"], [line])
-    with pytest.raises(InputError, match=rf"heads_test\.txt: {message}"):
-        with_sfm_poses(RECORDING, tmp_path, "heads")
+    refused(rf"heads_test\.txt: {message}", read, heads, tmp_path)
     (tmp_path / "heads_test.txt").unlink()
-    with pytest.raises(
-        InputError, match=r"heads_test\.txt: pose file is missing; get the folder"
-    ):
-        with_sfm_poses(RECORDING, tmp_path, "heads")
+    message = r"heads_test\.txt: pose file is missing; get the folder"
+    refused(message, read, heads, tmp_path)
 
 
 def test_another_folder_of_the_repository_is_told_from_the_right_one(
+    heads: Path,
     tmp_path: Path,
 ) -> None:
     right = tmp_path / "pgt/sfm/7scenes"
-    right.mkdir(parents=True)
     lines = [f"seq-02/frame-000000.color.png {LINE}"]
     write(right, lines, [f"seq-01/frame-000000.color.png {LINE}"])
     other = tmp_path / "pgt/sfm/12scenes"
     other.mkdir()
     original = tmp_path / "pgt/dslam/7scenes"
-    original.mkdir(parents=True)
     write(original, lines, lines)
     for folder in (tmp_path, tmp_path / "pgt", right.parent, other, original):
-        with pytest.raises(InputError, match=f"motion; give `poses` {right}$"):
-            with_sfm_poses(RECORDING, folder, "heads")
-    assert len(with_sfm_poses(RECORDING, right, "heads").train) == 1
+        refused(f"motion; give `poses` {right}$", read, heads, folder)
+    assert len(read(heads, right).train) == 1
