@@ -1,6 +1,6 @@
 """Losses of replayed rows beyond the paper's, for `evercal bench SUITE --plugin`.
 
-Each strategy keeps the frames of SARS and changes one thing. The rows are in
+Each strategy fills the memory with frames of SARS and has another loss. The rows are in
 research/network-trials.md.
 """
 
@@ -10,7 +10,6 @@ from torch import Tensor
 
 from evercal.continual.methods.penalties import (
     AnchoredReprojection,
-    Distillation,
     Penalty,
     Reprojection,
 )
@@ -48,10 +47,9 @@ def _named(name: str, method: Replay) -> Strategy:
 STRATEGIES = {
     strategy.name: strategy
     for strategy in (
-        _named("filled_spdd", Replay("sars_filled", Distillation(), weight=10.0)),
         _named("filled_anchored", Replay("sars_filled", AnchoredReprojection())),
         _named("filled_pixels", Replay("sars_filled", OldPixels(), weight=3.0)),
         _named("filled_old_pixels", Replay("sars_filled", OldPixels(1.0), weight=3.0)),
     )
 }
-"""Names and strategies; `filled_spdd` is `sars_spdd_filled` as a control."""
+"""Names and strategies. `sars_spdd_filled` is their control."""
