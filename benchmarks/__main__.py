@@ -73,6 +73,7 @@ VERBS = {
     "cluster": ("cluster", "learning and serving on a Ray cluster, beside one process"),
     "mutants": ("mutants", "small changes of the code that the tests should notice"),
     "networks": ("networks", "the experiments on networks; the paper's table on a GPU"),
+    "sars-units": ("sars_units", "frames that SARS keeps, by the unit of positions"),
     "wheels": ("wheels", "what lacks wheels on the platforms of docs/install.md"),
     "depth-poses": ("depth_poses", "poses of 7-Scenes, of the depth or colour camera"),
     "layouts": ("layouts", "7-Scenes and 12-Scenes as published, with other images"),

@@ -383,6 +383,9 @@ TABLES: dict[str, Callable[[], Table]] = {
     "network-checks: the paper's head": network_tables.summary("networks-b"),
     "network-checks: memory": network_tables.memory,
     "network-checks: real rooms": network_tables.summary("networks-real"),
+    "network-trials: units of positions": _rows(
+        "room,frames,side,metre,axes,reach,deviation", "sars-units"
+    ),
     "network-trials: tuning": _tuning("tuned-converged", "sim-tune"),
     "network-trials: tuning of the paper's head": _tuning(
         "tuned-paper-head", "sim-tune"

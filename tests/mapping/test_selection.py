@@ -241,3 +241,21 @@ def test_scene_without_frames():
 def test_misuse_is_refused(positions, quaternions, capacity, message):
     with pytest.raises(ValueError, match=message):
         select_sars(positions, quaternions, capacity)
+
+
+@pytest.mark.parametrize(
+    ("unit", "scale"),
+    [
+        ("side", (4.0, 4.0, 4.0)),
+        ("metre", (1.0, 1.0, 1.0)),
+        ("axes", (4.0, 2.0, 1.0)),
+        ("reach", (math.sqrt(5.0), math.sqrt(5.0), math.sqrt(5.0))),
+        ("deviation", (2.0, 1.0, 1.0)),
+    ],
+)
+def test_positions_are_divided_by_their_unit(unit, scale):
+    """Four cameras in a plane; an axis without extent has the unit 1."""
+    corners = np.array([[0.0, 0, 3], [4, 0, 3], [0, 2, 3], [4, 2, 3]])
+    still = np.tile([1.0, 0, 0, 0], (4, 1))
+    space = PoseSpace.of(corners, still, 1.0, unit)
+    np.testing.assert_allclose(space.positions.T, corners / scale)

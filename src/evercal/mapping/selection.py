@@ -6,26 +6,41 @@ wxyz, ``(n, 4)``, in any frame.
 
 The metric is the one of SARS (spatial-aware replay)::
 
-    D(a, b) = |p_a - p_b| / longest side + rotation_weight * 2 arccos |q_a . q_b|
+    D(a, b) = |(p_a - p_b) / unit| + rotation_weight * 2 arccos |q_a . q_b|
 
-with the longest side of the axis-aligned box around the scene's cameras (1 if all cameras have
-one position). The angle is computed as ``4 arcsin(chord / 2)``, where ``chord`` is the shorter of
-``|q_a - q_b|`` and ``|q_a + q_b|``. The two are equal, but arccos near 1 is exact to 3e-8 rad only,
-while the chord of identical rotations (``q`` and ``-q`` included) is exactly 0. D is symmetric to
-the last bit, so ties are real ties.
+The paper does not state the unit of positions. By default it is the longest side of the
+axis-aligned box around the scene's cameras (1 if all cameras have one position).
+
+The angle is computed as ``4 arcsin(chord / 2)``, where ``chord`` is the shorter of ``|q_a - q_b|``
+and ``|q_a + q_b|``. The two are equal, but arccos near 1 is exact to 3e-8 rad only, while the chord
+of identical rotations (``q`` and ``-q`` included) is exactly 0. D is symmetric to the last bit, so
+ties are real ties.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from evercal.classes import frozen
 from evercal.errors import require_numbers
+from evercal.geometry import norms
 from evercal.geometry.se3 import SE3
 from evercal.typing import Array, IntArray
+
+UNITS: Mapping[str, Callable[[Array], Array | float]] = {
+    "side": lambda positions_m: np.ptp(positions_m, axis=0).max(),
+    "metre": lambda positions_m: 1.0,
+    "axes": lambda positions_m: np.ptp(positions_m, axis=0),
+    "reach": lambda positions_m: norms(positions_m - positions_m.mean(axis=0)).max(),
+    "deviation": lambda positions_m: positions_m.std(axis=0),
+}
+"""Readings of the paper's normalised pose space: the unit of camera positions (n, 3), metres.
+
+The longest side of their box, a metre, each side of the box, the distance of the farthest camera
+from the mean, and the standard deviation along each axis."""
 
 
 @frozen
@@ -33,9 +48,11 @@ class SarsOptions:
     """When SARS rejects a pose as redundant."""
 
     radius: float = 0.5
-    """Exclusion radius r (scene sides + weighted radians): closer frames are rejected."""
+    """Exclusion radius r (units + weighted radians): closer frames are rejected."""
     rotation_weight: float = 1.0
-    """Weight lambda of the rotation angle (scene sides per radian)."""
+    """Weight lambda of the rotation angle (units per radian)."""
+    unit: str = "side"
+    """Unit of positions, a key of `UNITS`."""
     fill: bool = False
     """Ignore `radius` and search one that fills the capacity.
 
@@ -56,11 +73,11 @@ class PoseSpace:
     """The poses of one scene, scaled for the metric and stored one component per row."""
 
     positions: Array
-    """(3, n) positions divided by the longest side of their box."""
+    """(3, n) positions divided by their unit."""
     quaternions: Array
     """(4, n) unit quaternions, wxyz."""
     rotation_weight: float
-    """Scene sides per radian."""
+    """Units per radian."""
 
     @classmethod
     def of(
@@ -68,6 +85,7 @@ class PoseSpace:
         positions_m: Array,
         quaternions_wxyz: Array,
         rotation_weight: float = 1.0,
+        unit: str = "side",
     ) -> PoseSpace:
         """Check, scale and transpose ``(n, 3)`` positions and ``(n, 4)`` quaternions.
 
@@ -80,23 +98,21 @@ class PoseSpace:
             raise ValueError(
                 f"poses are (n, 3) and (n, 4), got {positions.shape} and {quaternions.shape}"
             )
-        norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
-        finite = np.isfinite(np.hstack([positions, norms])).all(axis=1)
-        bad = ~finite | (norms[:, 0] == 0)
+        lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
+        finite = np.isfinite(np.hstack([positions, lengths])).all(axis=1)
+        bad = ~finite | (lengths[:, 0] == 0)
         if bad.any():
             raise ValueError(
                 f"pose {int(np.argmax(bad))} is not finite or has a zero quaternion; "
                 "leave untracked frames out"
             )
-        greatest = positions.max(0, initial=-np.inf)
-        least = positions.min(0, initial=np.inf)
-        extent = greatest - least
-        side = float(extent.max())
-        if side <= 0:
-            side = 1.0
+        scale = np.ones(3)
+        if len(positions):
+            scale *= UNITS[unit](positions)
+        scale[scale <= 0] = 1.0
         return cls(
-            np.ascontiguousarray((positions / side).T),
-            np.ascontiguousarray((quaternions / norms).T),
+            np.ascontiguousarray((positions / scale).T),
+            np.ascontiguousarray((quaternions / lengths).T),
             rotation_weight,
         )
 
@@ -183,7 +199,9 @@ def select_sars(
     options = options or SarsOptions()
     if capacity < 0:
         raise ValueError(f"capacity is {capacity}; it is a number of frames >= 0")
-    space = PoseSpace.of(positions_m, quaternions_wxyz, options.rotation_weight)
+    space = PoseSpace.of(
+        positions_m, quaternions_wxyz, options.rotation_weight, options.unit
+    )
     radius = options.radius
     if options.fill:
         radius = _filling_radius(space, capacity, 1e-5)

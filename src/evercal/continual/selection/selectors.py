@@ -5,14 +5,13 @@ a class and the mean over an image as its feature. All return sorted indices.
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import numpy as np
 from numpy.random import Generator
 
 from evercal.continual.selection.frame_statistics import FrameStatistics
 from evercal.geometry import norms, unit_vectors
-from evercal.mapping.selection import SarsOptions, select_sars
+from evercal.mapping.selection import UNITS, SarsOptions, select_sars
 from evercal.typing import Array, IntArray
 
 GSS_COMPARED = 10
@@ -148,9 +147,12 @@ Select = Callable[[FrameStatistics, int], IntArray]
 """Maps the frames of a finished scene and a capacity to sorted indices of the keyframes."""
 
 
-def _sars(frames: FrameStatistics, capacity: int, fill: bool = False) -> IntArray:
-    options = SarsOptions(fill=fill)
-    return select_sars(frames.positions_m, frames.quaternions_wxyz, capacity, options)
+def _sars(options: SarsOptions) -> Select:
+    def select(frames: FrameStatistics, capacity: int) -> IntArray:
+        poses = frames.positions_m, frames.quaternions_wxyz
+        return select_sars(*poses, capacity, options)
+
+    return select
 
 
 SELECTORS: dict[str, Select] = {
@@ -161,7 +163,9 @@ SELECTORS: dict[str, Select] = {
     ),
     "leverage": lambda f, capacity: select_leverage(f.features(), capacity, f.rng()),
     "gradients": lambda f, capacity: select_gradients(f.gradients(), capacity, f.rng()),
-    "sars": _sars,
-    "sars_filled": partial(_sars, fill=True),
+    "sars": _sars(SarsOptions()),
+    "sars_filled": _sars(SarsOptions(fill=True)),
+    **{f"sars_{unit}": _sars(SarsOptions(unit=unit)) for unit in UNITS},
 }
-"""`sars` uses the paper's fixed radius, `sars_filled` a radius that fills the memory."""
+"""`sars` has the paper's fixed radius, `sars_filled` a radius that fills the memory, and the others
+the fixed radius with another unit of positions, see `UNITS`."""
