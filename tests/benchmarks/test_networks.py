@@ -22,11 +22,12 @@ def test_experiments_have_valid_options_and_folders_of_their_own() -> None:
 
 
 def test_filled_sars_has_the_setting_of_sars_spdd() -> None:
-    ours = networks.tuned(10.0)
-    assert ours["sars_spdd_filled"].description()["method"] == {
-        **ours["sars_spdd"].description()["method"],  # pyright: ignore[reportGeneralTypeIssues]
-        "selector": "sars_filled",
-    }
+    for head in (False, True):
+        plain, filled = networks.chosen(("sars_spdd", "sars_spdd_filled"), head)
+        assert filled.description()["method"] == {
+            **plain.description()["method"],  # pyright: ignore[reportGeneralTypeIssues]
+            "selector": "sars_filled",
+        }
 
 
 def test_an_unknown_experiment_is_refused() -> None:
