@@ -1,10 +1,10 @@
 """Tables and figures of a folder of results.
 
-OUT/tables.md     all tables, with the definitions of their columns
+OUT/tables.md     all tables: means, contrasts, definitions of the columns
 OUT/tables.tex    the tables of the paper, its rows below ours
 OUT/bars.svg      final accuracy of each scene
-OUT/figure.svg    accuracy of each scene while later ones are learned
-OUT/overlays.png  test images and their contours by the pose of each strategy
+OUT/figure.svg    accuracy over stages: each scene while later ones are learned
+OUT/overlays.png  test images: their contours by the pose of each strategy
 """
 
 from pathlib import Path
