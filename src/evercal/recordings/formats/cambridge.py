@@ -36,6 +36,8 @@ _LAYOUT = "image X Y Z W P Q R"
 """A line of a list."""
 _HEADER = 3
 """Lines of a list before the first image."""
+_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
+"""Signs of the inverse rotation."""
 _FARTHEST_M = 1e4
 """Farthest plausible position, metres."""
 
@@ -84,8 +86,8 @@ def _poses(file: Path) -> dict[str, SE3]:
     poses = {}
     with named_errors(file, "list of images"):
         for name, numbers in numbers_by_image(file, "\n".join(rows), _LAYOUT).items():
-            turn = SE3(np.array(numbers[3:]), np.zeros(3)).inverse()
-            pose = SE3(turn.rotation_wxyz, np.array(numbers[:3]))
+            inverse = np.array(numbers[3:]) * _CONJUGATE
+            pose = SE3(inverse, np.array(numbers[:3]))
             poses[path_inside(name, "the name of an image")] = pose
     return poses
 
