@@ -24,7 +24,7 @@ def picture(scene: Recording, shift_m: float, folder: Path) -> Image:
     results = []
     for frame in scene.test:
         assert frame.base_from_camera
-        estimated = frame.base_from_camera @ SE3([1, 0, 0, 0], [shift_m, 0, 0])
+        estimated = frame.base_from_camera @ SE3.exp([shift_m, 0, 0, 0, 0, 0])
         results.append(
             FrameResult(
                 scene.name,
