@@ -58,6 +58,8 @@ class Bench(args.Verb, Training):
     """Keyframes to keep of a scene: a share of its frames (10%) or bytes (5MB)."""
     held_out: bool = False
     """Evaluate on a fifth of the training frames instead of the test frames, to choose settings."""
+    tune: bool = False
+    """Try every strategy with several weights on held-out frames, and write tuned.csv."""
     out: args.OutFolder = Path("evercal-bench")
     """Folder of results. The same command resumes there; in a second process it shares the runs."""
 
@@ -67,13 +69,14 @@ class Bench(args.Verb, Training):
         seeds = _numbers(self.seeds)
         from evercal.continual.benchmark.bench import BenchOptions, run_bench
         from evercal.continual.benchmark.suites import tuning_split
+        from evercal.continual.benchmark.tuning import run_tuning
         from evercal.continual.learning.presets import short_side
 
         self.load_plugin()
         strategies = self._strategies()  # refused before recordings are read
         scenes = self._recorded()
         judged = "test frames"
-        if self.held_out:
+        if self.held_out or self.tune:
             scenes = list(map(tuning_split, scenes))
             judged = "held-out training frames"
         poses = self.poses if self.poses in ("original", "colour") else "sfm"
@@ -89,7 +92,8 @@ class Bench(args.Verb, Training):
         )
         with Bars(self.log) as bars:
             options = dataclasses.replace(options, on_event=observer(bars))
-            for step in run_bench(scenes, options, self.out):
+            run = run_tuning if self.tune else run_bench
+            for step in run(scenes, options, self.out):
                 bars.write(_progress(step, self.suite))
         return self._show(self.out, strategies[0].name)
 
