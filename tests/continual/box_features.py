@@ -57,7 +57,9 @@ def learnable(box: BoxRoom) -> Learnable:
                 torch.from_numpy(rng.normal(size=6)), dim=0
             )
             rows = torch.from_numpy(features).float()
-            buffer.append(view, (rows, descriptor), torch.ones(300, dtype=torch.bool))
+            buffer.append(
+                view, (rows, descriptor.float()), torch.ones(300, dtype=torch.bool)
+            )
             everything.append(torch.from_numpy(ATLAS_FROM_BASE.apply(points)).float())
         return buffer, torch.cat(everything)
 

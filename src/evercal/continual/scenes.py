@@ -74,7 +74,7 @@ class LearnedScenes:
     method_states: list[Mapping[str, Tensor]] = field(default_factory=list)
     """Named tensors that the method keeps of each scene."""
     cache: Path | None = None
-    """Folder of depths that runs over the same frames share; not stored."""
+    """Folder of features and depths that runs over the same frames share; not stored."""
 
     @property
     def device(self) -> torch.device:

@@ -8,10 +8,12 @@ stages/0001-NAME/
   keyframes.safetensors    remembered frames
   state.safetensors        what else the method keeps of the scene
   report.json
+  training.csv             loss, inliers and rate of the training
 """
 
 import hashlib
 import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -118,8 +120,10 @@ class NetworkStore(StageStore[LearnedScenes]):
         if listed(HEAD):
             scenes.heads.append(_read_head(folder, scenes.encoder.width))
 
-    def commit(self, scenes: LearnedScenes, report: Record) -> None:
-        """Add the newest scene of `scenes`: whole, or not at all."""
+    def commit(
+        self, scenes: LearnedScenes, report: Record, curve: Path | None = None
+    ) -> None:
+        """Add the newest scene of `scenes`, and the curve of its training: whole, or not at all."""
         record = scenes.scenes[-1]
         keyframes = scenes.keyframes[-1]
 
@@ -135,6 +139,8 @@ class NetworkStore(StageStore[LearnedScenes]):
             if scenes.method_states[-1]:
                 save_tensors(folder / STATE, _arrays(scenes.method_states[-1]))
             write_report(folder, report)
+            if curve and curve.is_file():
+                shutil.copyfile(curve, folder / curve.name)
 
         shared = len(scenes.heads) == 1
         payload = {

@@ -218,3 +218,55 @@ def test_part_and_join_are_inverse(filled: Filled) -> None:
         assert torch.equal(getattr(again, name), getattr(rows, name))
     for name in ("pixels", "intrinsics", "camera_from_atlas"):
         assert torch.equal(getattr(again.target, name), getattr(rows.target, name))
+
+
+def test_a_training_within_its_limit_is_what_it_was(
+    frames: list[Frame], filled: Filled
+) -> None:
+    whole = filled()
+    assert PLAN.rows(frames, 8) >= len(whole)
+    limited = replace(PLAN, most_rows=PLAN.rows(frames, 8))
+    assert limited.limited(frames, 8) is limited
+    assert same(filled(limited), whole)
+
+
+@pytest.mark.parametrize(
+    ("each", "views", "cells"), [(130, 3, 40), (119, 2, 40), (79, 1, 40), (7, 1, 7)]
+)
+def test_a_limit_takes_rows_of_views_then_views_then_cells(
+    each: int, views: int, cells: int, frames: list[Frame], filled: Filled
+) -> None:
+    plan = replace(PLAN, most_rows=each * len(frames)).limited(frames, 8)
+    assert (plan.views_per_frame, plan.cells) == (views, cells)
+    buffer = filled(plan)
+    assert len(buffer) <= plan.rows(frames, 8) <= each * len(frames)
+    counts = torch.bincount(buffer.tensors["view"].long())
+    assert counts.tolist() == [cells] * (views * len(frames))
+    # The limit of a training holds for its parts.
+    assert plan.limited(frames[:3], 8) == plan
+    # A thinned plain view has other cells for another seed.
+    other = filled(replace(plan, seed=6))
+    assert not torch.equal(buffer.tensors["pixels"], other.tensors["pixels"])
+
+
+def test_every_frame_keeps_a_row(frames: list[Frame], filled: Filled) -> None:
+    plan = replace(PLAN, most_rows=3).limited(frames, 8)
+    assert torch.equal(filled(plan).tensors["view"], torch.arange(7, dtype=torch.int32))
+
+
+def test_rows_take_the_memory_of_one_copy(filled: Filled) -> None:
+    """Features are written where they stay, even if more come than were planned."""
+    buffer = filled()
+    features = buffer.tensors["features"]
+    first = {name: value[:50] for name, value in buffer.tensors.items()}
+    grown = FeatureBuffer(4, ATLAS_FROM_BASE)
+    for _ in range(9):
+        grown.extend(first)
+    assert torch.equal(grown.tensors["features"], features[:50].cpu().repeat(9, 1))
+    planned = FeatureBuffer(4, ATLAS_FROM_BASE)
+    planned.planned = 100
+    planned.extend(first)
+    planned.extend(first)
+    assert torch.equal(planned.tensors["features"], features[:50].cpu().repeat(2, 1))
+    place = planned.tensors["features"].untyped_storage()
+    assert place.nbytes() == planned.tensors["features"].nbytes

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from evercal.continual.networks.feature_cache import cache_features
+from evercal.continual.networks.descriptor import PooledDescriptor
+from evercal.continual.networks.feature_cache import cache_features, row_encoder
 from evercal.features.encoder import Encoder
 from evercal.typing import Float32Array
 
@@ -87,3 +89,49 @@ def test_full_disk_only_stops_caching(
     )
     assert len(tries) == 3
     assert len([path for path in tmp_path.rglob("*") if path.is_file()]) == 1
+
+
+def test_kept_rows_are_encoded_once_and_others_take_no_space(tmp_path: Path) -> None:
+    encoder, counting = made()
+    descriptor = PooledDescriptor(encoder.width, 5)
+    keep = np.array([True, False, False, True, True, False])
+    plain = row_encoder(encoder, descriptor)
+    expected = [plain(image, keep) for image in IMAGES]
+    features, vector = expected[0]
+    assert (features.shape, features.dtype) == ((3, 8), torch.half)
+    torch.testing.assert_close(
+        features.float(),
+        torch.from_numpy(encoder(IMAGES[0])).flatten(0, 1)[keep],
+        rtol=0,
+        atol=1e-3,
+    )
+    counting.captured = 0
+    cached = row_encoder(encoder, descriptor, tmp_path)
+    for _ in range(2):
+        for image, (features, vector) in zip(IMAGES, expected, strict=True):
+            again = cached(image, keep)
+            assert torch.equal(again[0], features)
+            assert torch.equal(again[1], vector)
+    assert counting.captured == len(IMAGES)
+    sizes = [path.stat().st_size for path in tmp_path.rglob("*.npy")]
+    assert len(sizes) == len(IMAGES)
+    assert max(sizes) == 128 + 2 * 3 * 8 + 4 * 5  # a header of NumPy, halves, singles
+    # Other cells, another descriptor and another encoder have rows of their own.
+    cached(IMAGES[0], ~keep)
+    row_encoder(encoder, PooledDescriptor(encoder.width, 6), tmp_path)(IMAGES[0], keep)
+    assert counting.captured == len(IMAGES) + 2
+    other, others = made(1.0)
+    row_encoder(other, descriptor, tmp_path)(IMAGES[0], keep)
+    assert others.captured == 1
+
+
+def test_a_damaged_file_of_rows_is_replaced(tmp_path: Path) -> None:
+    encoder, counting = made()
+    cached = row_encoder(encoder, PooledDescriptor(encoder.width, 5), tmp_path)
+    keep = np.ones(6, bool)
+    before = cached(IMAGES[0], keep)
+    (file,) = tmp_path.rglob("*.npy")
+    file.write_bytes(file.read_bytes()[:-3])
+    again = cached(IMAGES[0], keep)
+    assert all(torch.equal(*pair) for pair in zip(before, again, strict=True))
+    assert counting.captured == 2

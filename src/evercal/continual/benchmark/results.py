@@ -39,6 +39,8 @@ STRATEGIES = "strategies.json"
 """File of the descriptions of strategies."""
 ENVIRONMENTS = "environments.json"
 """File of commits, versions and processors."""
+CURVES = "training"
+"""Folder of the curves of trainings, a folder for each."""
 WITHIN = {
     "within_10cm_10deg": (0.10, math.radians(10.0)),
     "within_5cm_5deg": metrics.COARSE,

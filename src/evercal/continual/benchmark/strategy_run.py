@@ -14,11 +14,13 @@ from filelock import FileLock
 from evercal.classes import frozen
 from evercal.continual.benchmark.overlays import record_overlay
 from evercal.continual.benchmark.results import (
+    CURVES,
     StageResults,
     frame_row,
     record_environment,
     scene_row,
 )
+from evercal.continual.learning.checkpoint import CHECKPOINT
 from evercal.continual.learning.learn import finish_scene, learn_jointly
 from evercal.continual.learning.learn_networks import (
     NetworkLearnOptions,
@@ -113,6 +115,7 @@ class _Run:
         self.on_event = options.on_event
         self.stage = _with_centres(options.stage(seed), self.scenes)
         self.features = out.absolute() / "features"
+        self.curves = out / CURVES
         self.store = out / "runs" / f"{strategy.name}-{seed}"
 
     def _remove(self) -> None:
@@ -186,16 +189,18 @@ class _NetworkRun(_Run):
         self._remove()
 
     def jointly(self) -> Iterator[StageResults]:
-        self._remove()  # an interrupted run starts again
+        folder = self.curves / self.store.name
+        folder.mkdir(parents=True, exist_ok=True)
         empty = self._prepared(self._new_store().contents)
         began = perf_counter()
-        learned = learn_jointly(empty, self.scenes, self.stage, self.on_event)
+        learned = learn_jointly(empty, self.scenes, self.stage, self.on_event, folder)
         seconds = perf_counter() - began
         last = len(self.scenes) - 1
         nothing = pd.DataFrame()
         for number in range(last):
             yield StageResults(number, nothing, nothing)
         yield self._located(learned, last, seconds)
+        (folder / CHECKPOINT).unlink(missing_ok=True)
 
     def _learn(self, store: Path, scene: Recording, strategy: Strategy) -> None:
         options = NetworkLearnOptions(
@@ -205,6 +210,7 @@ class _NetworkRun(_Run):
             device=str(self.device),
             cache=self.features,
             holds_out=False,
+            folder=self.curves / f"{store.name}-{scene.name}",
         )
         learn_networks(store, scene, options, self.on_event)
 
@@ -213,7 +219,6 @@ class _NetworkRun(_Run):
 
     def _prepared(self, scenes: LearnedScenes) -> LearnedScenes:
         scenes.to(self.device)
-        cache_features(scenes.encoder, self.features)
         scenes.cache = self.features
         return scenes
 
@@ -260,6 +265,7 @@ class _NetworkRun(_Run):
             "head_bytes": sum(map(head_bytes, scenes.heads)),
             "frames_kept": scenes.frames_kept,
         }
+        cache_features(scenes.encoder, self.features)  # test frames are located often
         localizer = NetworkLocalizer(scenes, NETWORK_LOCALIZE)
         return self._evaluated(localizer, number, costs)
 

@@ -4,14 +4,21 @@ import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from evercal.continual.learning.checkpoint import trained
 from evercal.continual.learning.stage import OnEvent, StageOptions, unobserved
 from evercal.continual.learning.stage_rows import StageRows
 from evercal.continual.learning.surfaces import shared_depths, surface_points
-from evercal.continual.methods.method import FinishedScene, Method, StageStart
+from evercal.continual.methods.method import (
+    FineTuning,
+    FinishedScene,
+    Method,
+    StageStart,
+)
 from evercal.continual.networks.atlas import Atlas, Cell, camera_clusters
 from evercal.continual.networks.buffer import FeatureBuffer, join
 from evercal.continual.networks.head import Head, fresh_head
@@ -36,10 +43,11 @@ def learn(
     recording: Recording,
     options: StageOptions,
     on_event: OnEvent = unobserved,
+    folder: Path | None = None,
 ) -> LearnedScenes:
     """Learn one more scene from the training frames of a recording; `scenes` is not changed.
 
-    Thresholds are not fitted yet.
+    Thresholds are not fitted yet. With a `folder`, a call that was killed goes on.
     """
     after = scenes.copy_for_training()
     teacher = None
@@ -64,7 +72,7 @@ def learn(
     )
     hooks = method.begin(start)
     trainer = HeadTrainer(head, [buffer], options.fit, options.seed, hooks)
-    for progress in trainer.run():
+    for progress in trained(trainer, method, folder):
         on_event(progress)
     after.scenes.append(trained_record(recording, cell, buffer))
     finish_scene(after, method, recording.train, lambda: buffer, options)
@@ -76,6 +84,7 @@ def learn_jointly(
     recordings: Sequence[Recording],
     options: StageOptions,
     on_event: OnEvent = unobserved,
+    folder: Path | None = None,
 ) -> LearnedScenes:
     """Train one head on several scenes, with the steps and rows of the same number of stages.
 
@@ -84,6 +93,10 @@ def learn_jointly(
     """
     after = start.copy_for_training()
     fit = options.fit
+    view = replace(options.encode.view, short_side=start.short_side)
+    frames = [frame for recording in recordings for frame in recording.train]
+    plan = replace(options.encode, view=view).limited(frames, start.encoder.stride)
+    options = replace(options, encode=plan)
     encoder = StageRows(after, options, on_event)
     atlas = after.atlas(options.grid_scenes)
     buffers = [_begun(encoder, atlas, recording)[1] for recording in recordings]
@@ -95,7 +108,7 @@ def learn_jointly(
     iterations = fit.iterations * len(recordings)
     whole = replace(fit, iterations=iterations, batch=batch)
     trainer = HeadTrainer(head, buffers, whole, options.seed)
-    for progress in trainer.run():
+    for progress in trained(trainer, FineTuning(), folder):
         on_event(progress)
     for number, recording in enumerate(recordings):
         cell = atlas.cells[number]

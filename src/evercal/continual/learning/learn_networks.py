@@ -1,5 +1,7 @@
 """`learn_networks`: what the command line calls to learn a scene into a store of networks."""
 
+import shutil
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import field, replace
 from functools import partial
@@ -7,11 +9,17 @@ from pathlib import Path
 from time import perf_counter
 
 from evercal.classes import frozen
+from evercal.continual.learning.checkpoint import CHECKPOINT, CURVE
 from evercal.continual.learning.learn import learn
 from evercal.continual.learning.presets import preset, short_side
-from evercal.continual.learning.stage import OnEvent, StageOptions, unobserved
+from evercal.continual.learning.stage import (
+    Encoding,
+    OnEvent,
+    StageOptions,
+    unobserved,
+)
 from evercal.continual.networks.device import device_of
-from evercal.continual.networks.feature_cache import cache_features
+from evercal.continual.networks.trainer import Progress
 from evercal.continual.store import NetworkStore, head_bytes
 from evercal.continual.strategies import Strategy, strategy_named
 from evercal.continual.threshold import fit_threshold
@@ -30,6 +38,7 @@ from evercal.recordings.held_out import (
     split_held_out,
 )
 from evercal.storage.stages import is_store
+from evercal.typing import JsonObject
 
 
 @frozen
@@ -38,6 +47,16 @@ class NetworkReport(LearnReport):
 
     iterations: int = 0
     """Training steps."""
+    loss: float | None = None
+    """Mean loss of the new rows in the last step."""
+    inlier_share: float | None = None
+    """Share of the new rows within 5 px in the last step."""
+    preset: str = ""
+    """Name of the preset."""
+    strategy: JsonObject = field(default_factory=dict)
+    """Name of the strategy, and its method with hyper-parameters."""
+    seed: int = 0
+    """Seed of all random draws."""
     head_bytes: int = 0
     """Size of the networks."""
 
@@ -64,11 +83,19 @@ class NetworkLearnOptions:
     """Folder for features of views, for many runs over the same frames."""
     holds_out: bool = True
     """Whether a few training frames are held out to fit the inlier threshold and the covariance."""
+    folder: Path | None = None
+    """Folder for checkpoint and curve of the training, which keeps the curve; by default one beside
+    the store, which is removed."""
 
     def opened(
         self, store: Path, strategy: Strategy, frames: Sequence[Frame]
     ) -> NetworkStore:
         """Open the store of a strategy or make it; `frames` are those of the scene to learn."""
+        if not strategy.method or strategy.jointly:
+            raise InputError(
+                f"strategy {strategy.name!r}: does not train a network scene by scene; use another"
+                " strategy, or compare it with 'evercal bench'"
+            )
         if self.stage.memory.auto:
             raise InputError(
                 "memory auto: only a map selects its keyframes; give a share or bytes"
@@ -87,8 +114,7 @@ class NetworkLearnOptions:
                 " use that one or start a new store"
             )
         heads = opened.contents.heads
-        method = strategy.method
-        if self.centres is None or not method or method.head_per_scene:
+        if self.centres is None or strategy.method.head_per_scene:
             return opened
         for head in heads[-1:]:
             count = head.options.centres_per_scene
@@ -100,6 +126,19 @@ class NetworkLearnOptions:
         return opened
 
 
+def _posed(recording: Recording, strategy: Strategy) -> Recording:
+    """A recording with enough frames, all of which have poses."""
+    if lacks_camera_poses(recording):
+        raise InputError(
+            f"scene {recording.name!r}: only gripper poses are stated, and strategy"
+            f" {strategy.name!r} builds no map to estimate the camera on the gripper; use"
+            " strategy evercal"
+        )
+    recording = posed_recording(recording)
+    require_frames(recording)
+    return recording
+
+
 def learn_networks(
     store: Path,
     recording: Recording,
@@ -107,6 +146,9 @@ def learn_networks(
     on_event: OnEvent = unobserved,
 ) -> NetworkReport:
     """Learn a scene into a store; an interrupted call leaves the store at its last scene.
+
+    The same call goes on where it was interrupted, with the folder `.STORE.learning` beside the
+    store. The folder is removed when the scene is complete.
 
     Args:
         store: folder of the store; created if it is missing.
@@ -119,32 +161,30 @@ def learn_networks(
     strategy = options.strategy
     if isinstance(strategy, str):
         strategy = strategy_named(strategy)
-    if not strategy.method or strategy.jointly:
-        raise InputError(
-            f"strategy {strategy.name!r}: does not train a network scene by scene; use another"
-            " strategy, or compare it with 'evercal bench'"
-        )
     opened = options.opened(store, strategy, recording.train)
+    assert strategy.method, "that of a network"
     with opened.writing():
         contents = opened.contents.to(device_of(options.device))
         taken = [record.name for record in contents.scenes]
-        recording = named_recording(recording, None, taken)
-        if lacks_camera_poses(recording):
-            raise InputError(
-                f"scene {recording.name!r}: only gripper poses are stated, and strategy"
-                f" {strategy.name!r} builds no map to estimate the camera on the gripper; use"
-                " strategy evercal"
-            )
-        recording = posed_recording(recording)
-        require_frames(recording)
-        if options.cache:
-            cache_features(contents.encoder, options.cache)
-            contents.cache = options.cache
+        recording = _posed(named_recording(recording, None, taken), strategy)
+        resolved = store.resolve()
+        beside = resolved.with_name(f".{resolved.name}.learning")
+        folder = options.folder or beside
+        folder.mkdir(parents=True, exist_ok=True)
+        contents.cache = options.cache or beside
+        steps = deque[Progress](maxlen=1)
+
+        def observe(event: Encoding | Progress) -> None:
+            if isinstance(event, Progress):
+                steps.append(event)
+            on_event(event)
+
         split = HeldOutSplit(recording.train, ())
         if options.holds_out:
             split = split_held_out(recording.train)
         train = replace(recording, train=split.train)
-        learned = learn(contents, strategy.method, train, stage, on_event)
+        learned = learn(contents, strategy.method, train, stage, observe, folder)
+        [last] = steps
         if split.held_out:
             learned.scenes[-1] = fit_threshold(learned, split.held_out)
         report = NetworkReport(
@@ -155,7 +195,14 @@ def learn_networks(
             train_frames=len(split.train),
             held_out_frames=len(split.held_out),
             iterations=stage.fit.iterations,
+            loss=last.loss,
+            inlier_share=last.inlier_share,
+            preset=options.preset,
+            strategy={"name": strategy.name, **strategy.description()},
+            seed=stage.seed,
             head_bytes=sum(map(head_bytes, learned.heads)),
         )
-        opened.commit(learned, report.to_dict())
+        opened.commit(learned, report.to_dict(), folder / CURVE)
+        (folder / CHECKPOINT).unlink(missing_ok=True)
+        shutil.rmtree(beside, ignore_errors=True)
     return report

@@ -34,7 +34,8 @@ PRESETS: dict[str, StageOptions] = {
     # (research/protocol.md).
     "converged": _ours(width=256, steps=1200, rows=1536, views=4),
     # The paper's settings, for a GPU: AdamW at 0.005 and 15,000 steps per scene. The rows of a step
-    # are GLACE's. The paper does not state the number of replayed rows; here it is the same.
+    # and of the buffer are GLACE's. The paper does not state the number of replayed rows; here it
+    # is the same.
     "paper": StageOptions(
         head=HeadOptions(
             width=768,
@@ -52,7 +53,7 @@ PRESETS: dict[str, StageOptions] = {
             warm_share=0.3,
             loss=LossOptions(schedule="circle", clamp_start_px=50.0),
         ),
-        encode=EncodePlan(views_per_frame=8, cells=1024),
+        encode=EncodePlan(views_per_frame=8, cells=1024, most_rows=16_000_000),
     ),
 }
 

@@ -51,10 +51,11 @@ class StageRows:
         self, buffer: FeatureBuffer, frames: Sequence[Frame], plan: EncodePlan
     ) -> FeatureBuffer:
         scenes = self.scenes
-        total = len(frames) * plan.views_per_frame
         plan = replace(plan, view=replace(plan.view, short_side=scenes.short_side))
+        plan = plan.limited(frames, scenes.encoder.stride)
+        total = len(frames) * plan.views_per_frame
         for done in encode_frames(
-            buffer, frames, plan, scenes.encoder, scenes.descriptor
+            buffer, frames, plan, scenes.encoder, scenes.descriptor, scenes.cache
         ):
             self.on_event(Encoding(done, total))
         return buffer

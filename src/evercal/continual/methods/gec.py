@@ -94,6 +94,7 @@ class EpisodicConstraint(EpisodicMemory):
 
 class _ConstraintHooks(MemoryHooks):
     edits_steps = True
+    carried = ("_steps",)
 
     def __init__(self, method: EpisodicConstraint, start: StageStart):
         super().__init__(start)

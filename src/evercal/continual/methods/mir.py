@@ -85,6 +85,8 @@ class MaximallyInterferedRetrieval(Replay):
 
 
 class _MirHooks(ReplayHooks):
+    carried = ("_views",)
+
     def __init__(self, method: MaximallyInterferedRetrieval, start: StageStart):
         super().__init__(method, start)
         self._options = method

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,7 +11,8 @@ from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from evercal.classes import frozen
-from evercal.continual.networks.descriptor import Descriptor, described
+from evercal.continual.networks.descriptor import Descriptor
+from evercal.continual.networks.feature_cache import row_encoder
 from evercal.continual.networks.loss import Target
 from evercal.errors import require_numbers
 from evercal.features.encoder import Encoder
@@ -82,31 +84,46 @@ class FeatureBuffer:
         self.views = 0
         self.known: Tensor | None = None
         """(rows, 3) known points, on the buffer's device, see `Rows.known`."""
+        self.planned = 0
+        """Rows for whose features memory is reserved at once, so that no second copy is needed."""
+        self._rows = 0
+        self._features = torch.zeros(0)
         self._parts: list[dict[str, Tensor]] = []
         self._merged: dict[str, Tensor] | None = None
 
     def append(self, view: View, encoded: tuple[Tensor, Tensor], keep: Tensor) -> None:
-        """Append the rows of a view that a mask (cells,) keeps.
+        """Append the rows of a view: of the cells that a mask (cells,) keeps.
 
-        `encoded` are features (cells, channels) and a descriptor (width,) on any device.
+        `encoded` are their features (rows, channels) and the descriptor (width,) of the view.
         """
         features, descriptor = encoded
         atlas_from_camera = self.atlas_from_base @ view.base_from_camera
         camera_from_atlas = torch.from_numpy(atlas_from_camera.inverse().matrix()[:3])
         count = int(keep.sum())
         part = {
-            "features": features.cpu()[keep].half(),
+            "features": features.half(),
             "pixels": torch.tensor(view.cell_pixels, device="cpu")[keep],
             "view": torch.full((count,), self.views, dtype=torch.int32, device="cpu"),
             "intrinsics": torch.from_numpy(view.intrinsics)[None],
             "camera_from_atlas": camera_from_atlas[None].float(),
-            "descriptors": descriptor.cpu()[None].float(),
+            "descriptors": descriptor[None].float(),
         }
         self.extend(part)
 
     def extend(self, part: Mapping[str, Tensor]) -> None:
         """Append rows by name, as in `tensors`."""
-        self._parts.append(dict(part))
+        rest = dict(part)
+        features = rest.pop("features")
+        rows = self._rows
+        end = rows + len(features)
+        if end > len(self._features):
+            longer = features.new_empty(max(self.planned, 2 * end), features.shape[1])
+            if rows:
+                longer[:rows] = self._features[:rows]
+            self._features = longer
+        self._features[rows:end] = features
+        self._rows = end
+        self._parts.append(rest)
         self.views += len(part["intrinsics"])
         self._merged = None
 
@@ -115,19 +132,17 @@ class FeatureBuffer:
         """All tensors by name, on the buffer's device."""
         if self._merged is not None:
             return self._merged
-        merged = {}
+        rest = {}
         for name in self._parts[0]:
             columns = [part[name].cpu() for part in self._parts]
-            merged[name] = torch.cat(columns).to(self.device)
-        self._replace(merged)
-        return merged
-
-    def _replace(self, tensors: dict[str, Tensor]) -> None:
-        self._merged = tensors
-        self._parts = [tensors]  # one copy in memory
+            rest[name] = torch.cat(columns).to(self.device)
+        self._parts = [rest]
+        self._features = self._features[: self._rows].to(self.device)
+        self._merged = {"features": self._features, **rest}
+        return self._merged
 
     def __len__(self) -> int:
-        return len(self.tensors["features"])
+        return self._rows
 
     @property
     def starts(self) -> Tensor:
@@ -200,7 +215,11 @@ class EncodePlan:
     views_per_frame: int = 4
     """Views of every frame; the first is not augmented."""
     cells: int = 600
-    """Rows taken from an augmented view; a plain view gives all rows."""
+    """Rows taken from an augmented view; a plain view gives all rows, unless `most_rows` is met."""
+    most_rows: int = 0
+    """Rows of a training, at most, but one of every frame; 0 for any number."""
+    thinned: bool = False
+    """Whether a plain view gives `cells` rows, too."""
     seed: int = 0
     """Seed of augmentations and of the cells that are taken."""
     view: ViewOptions = field(default_factory=ViewOptions)
@@ -210,6 +229,24 @@ class EncodePlan:
         """Check the numbers."""
         require_numbers(self, ("views_per_frame", "cells"), 1)
 
+    def rows(self, frames: Sequence[Frame], stride: int) -> int:
+        """Rows of frames, at most."""
+        plain = 0
+        for frame in frames:
+            small = frame.camera.short_side_resized(self.view.short_side)
+            grid = (small.height // stride) * (small.width // stride)
+            plain += min(grid, self.cells) if self.thinned else grid
+        return plain + (self.views_per_frame - 1) * self.cells * len(frames)
+
+    def limited(self, frames: Sequence[Frame], stride: int) -> "EncodePlan":
+        """The plan for all frames of a training, with fewer rows of a view, then fewer views."""
+        if not self.most_rows or self.rows(frames, stride) <= self.most_rows:
+            return self
+        each = max(1, self.most_rows // len(frames))
+        cells = min(self.cells, each)
+        views = min(self.views_per_frame, each // cells)
+        return replace(self, views_per_frame=views, cells=cells, thinned=True)
+
 
 def encode_frames(
     buffer: FeatureBuffer,
@@ -217,24 +254,27 @@ def encode_frames(
     plan: EncodePlan,
     encoder: Encoder,
     descriptor: Descriptor,
+    cache: Path | None = None,
 ) -> Iterator[int]:
     """Encode every frame `plan.views_per_frame` times; yields the number of views in the buffer.
 
     Pass 0 shows the frames unchanged, later passes augmented. A view and its cells depend only on
-    (seed, pass, frame).
+    (seed, pass, frame). Rows that are in the folder `cache` are not encoded again.
     """
     stride = encoder.stride
+    encoded = row_encoder(encoder, descriptor, cache)
+    buffer.planned = plan.rows(frames, stride)
     for visit in range(plan.views_per_frame):
         for position, frame in enumerate(frames):
             rng = np.random.default_rng([plan.seed, visit, position])
             if visit == 0:
                 view = frame_view(frame, stride, plan.view)
-                keep = view.valid
             else:
                 view = augmented_view(frame, stride, plan.view, rng)
-                valid = rng.permutation(np.flatnonzero(view.valid))
-                keep = np.zeros(len(view.valid), bool)
+            keep = view.valid
+            if visit > 0 or plan.thinned:
+                valid = rng.permutation(np.flatnonzero(keep))
+                keep = np.zeros(len(keep), bool)
                 keep[valid[: plan.cells]] = True
-            encoded = described(encoder(view.grey), descriptor)
-            buffer.append(view, encoded, torch.from_numpy(keep))
+            buffer.append(view, encoded(view.grey, keep), torch.from_numpy(keep))
             yield buffer.views

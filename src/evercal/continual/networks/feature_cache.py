@@ -4,14 +4,59 @@ import contextlib
 import hashlib
 import os
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from evercal.continual.networks.descriptor import (
+    Descriptor,
+    described,
+    descriptor_bytes,
+)
 from evercal.features.encoder import Encoder
-from evercal.typing import Array, Float32Array
+from evercal.typing import Array, BoolArray, Float32Array, Image
+
+RowEncoder = Callable[[Image, BoolArray], tuple[Tensor, Tensor]]
+"""Makes features (rows, channels) of the cells of an image that a mask (cells,) keeps, in half
+precision, and the descriptor (width,) of the image; both on the CPU."""
+
+
+def row_encoder(
+    encoder: Encoder, descriptor: Descriptor, cache: Path | None = None
+) -> RowEncoder:
+    """Encode rows of images, or read those that are in a folder."""
+
+    def encoded(grey: Image, keep: BoolArray) -> tuple[Tensor, Tensor]:
+        features, vector = described(encoder(grey), descriptor)
+        return features.cpu()[torch.from_numpy(keep)].half(), vector.cpu()
+
+    if not cache:
+        return encoded
+    key = hashlib.blake2b(descriptor_bytes(descriptor), digest_size=4)
+    folder = cache / f"{encoder_key(encoder)}-{key.hexdigest()}"
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def read(grey: Image, keep: BoolArray) -> tuple[Tensor, Tensor]:
+        key = hashlib.blake2b(grey.tobytes() + keep.tobytes(), digest_size=16)
+        path = folder / f"{key.hexdigest()}.npy"
+        stored = read_cached(path)
+        if stored is None:
+            features, vector = encoded(grey, keep)
+            # The descriptor keeps its single precision: two halves a channel.
+            halves = vector.numpy().view(np.float16)
+            stored = np.concatenate([features.numpy().ravel(), halves])
+            write_cached(path, stored)
+        count = int(keep.sum()) * encoder.width
+        features, halves = np.split(stored, [count])
+        features = torch.from_numpy(features.reshape(-1, encoder.width))
+        return features, torch.from_numpy(halves.view(np.float32))
+
+    return read
 
 
 def cache_features(encoder: Encoder, folder: Path) -> None:

@@ -7,6 +7,7 @@ from torch import Generator, Tensor
 
 from evercal.continual.networks.buffer import Rows
 from evercal.continual.networks.head import HeadOutput
+from evercal.typing import Strings
 
 
 @dataclass
@@ -30,6 +31,8 @@ class TrainingHooks:
 
     edits_steps = False
     """Whether `edit_step` is called. It costs a copy of all weights per step."""
+    carried: Strings = ()
+    """Attributes that later steps need from earlier ones: plain values and tensors."""
 
     def replayed(
         self, fresh: Rows, step: int, rate: float, generator: Generator

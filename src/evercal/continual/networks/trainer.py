@@ -1,8 +1,9 @@
 """The training loop of a head; a method takes part through hooks."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Generator, Tensor
@@ -69,6 +70,8 @@ class Progress:
     """(n,) loss of each new row in the last step."""
     errors_px: Tensor
     """(n,) reprojection error of each new row in the last step, pixels."""
+    rate: float
+    """Learning rate of AdamW in the last step."""
 
     # Properties, because reading a value synchronises with the GPU.
     @property
@@ -114,6 +117,27 @@ class HeadTrainer:
             yield progress
         self.head.eval()
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a trainer made in the same way needs to go on after the last step."""
+        hooks = self.hooks
+        return {
+            "step": self.step,
+            "head": self.head.state_dict(),
+            "optimisers": [optimiser.state_dict() for optimiser in self._optimisers],
+            "hooks": {name: getattr(hooks, name) for name in hooks.carried},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from the state of another trainer."""
+        self.step = state["step"]
+        self.head.load_state_dict(state["head"])
+        for optimiser, values in zip(
+            self._optimisers, state["optimisers"], strict=True
+        ):
+            optimiser.load_state_dict(values)
+        for name, value in state["hooks"].items():
+            setattr(self.hooks, name, value)
+
     def _train_step(self) -> Progress:
         options = self.options
         rate = one_cycle(options, self.step)
@@ -146,7 +170,7 @@ class HeadTrainer:
         loss.backward()
         self._take_step(losses, constraints, rate / options.peak_rate)
         self.step += 1
-        return Progress(self.step, options.iterations, costs.detach(), errors)
+        return Progress(self.step, options.iterations, costs.detach(), errors, rate)
 
     def _rows(self, rate: float) -> tuple[Rows, int]:
         generator = Generator().manual_seed(self.seed * 1_000_003 + self.step)
