@@ -5,11 +5,12 @@
     OUT/strategies.json           description of each strategy: method, hyper-parameters, map
     OUT/results.csv, frames.csv   see `benchmark.results`
     OUT/overlays/                 pictures, see `benchmark.overlays`
+    OUT/training/RUN/             curve of a training, and its checkpoint until it is complete
     OUT/features/                 encoded views, shared by all runs; may be deleted
     OUT/runs/STRATEGY-SEED/       store of a run in progress, removed when the run is complete
     OUT/runs/first-SCENE-SEED/    the first scene, shared by all networks
 
-An interrupted run resumes after its last complete stage. Several processes may work in one folder:
+An interrupted run goes on where it was, a minute earlier at most. Several processes may work in one folder:
 each takes runs that no other has.
 """
 

@@ -1,7 +1,6 @@
 """`learn_networks`: what the command line calls to learn a scene into a store of networks."""
 
 import shutil
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import field, replace
 from functools import partial
@@ -139,6 +138,20 @@ def _posed(recording: Recording, strategy: Strategy) -> Recording:
     return recording
 
 
+class _Last:
+    """Passes events on, and keeps the last step."""
+
+    step: Progress
+
+    def __init__(self, on_event: OnEvent):
+        self._on_event = on_event
+
+    def __call__(self, event: Encoding | Progress) -> None:
+        if isinstance(event, Progress):
+            self.step = event
+        self._on_event(event)
+
+
 def learn_networks(
     store: Path,
     recording: Recording,
@@ -172,19 +185,12 @@ def learn_networks(
         folder = options.folder or beside
         folder.mkdir(parents=True, exist_ok=True)
         contents.cache = options.cache or beside
-        steps = deque[Progress](maxlen=1)
-
-        def observe(event: Encoding | Progress) -> None:
-            if isinstance(event, Progress):
-                steps.append(event)
-            on_event(event)
-
         split = HeldOutSplit(recording.train, ())
         if options.holds_out:
             split = split_held_out(recording.train)
         train = replace(recording, train=split.train)
-        learned = learn(contents, strategy.method, train, stage, observe, folder)
-        [last] = steps
+        last = _Last(on_event)
+        learned = learn(contents, strategy.method, train, stage, last, folder)
         if split.held_out:
             learned.scenes[-1] = fit_threshold(learned, split.held_out)
         report = NetworkReport(
@@ -195,8 +201,8 @@ def learn_networks(
             train_frames=len(split.train),
             held_out_frames=len(split.held_out),
             iterations=stage.fit.iterations,
-            loss=last.loss,
-            inlier_share=last.inlier_share,
+            loss=last.step.loss,
+            inlier_share=last.step.inlier_share,
             preset=options.preset,
             strategy={"name": strategy.name, **strategy.description()},
             seed=stage.seed,

@@ -65,6 +65,10 @@ def _combined(
     )
 
 
+_OF_ROWS = ("features", "pixels", "view")
+"""Columns with an entry for each row; the others have one for each view."""
+
+
 class FeatureBuffer:
     """Feature rows of one scene, with poses and cameras in a side table (one entry per view).
 
@@ -85,11 +89,9 @@ class FeatureBuffer:
         self.known: Tensor | None = None
         """(rows, 3) known points, on the buffer's device, see `Rows.known`."""
         self.planned = 0
-        """Rows for whose features memory is reserved at once, so that no second copy is needed."""
-        self._rows = 0
-        self._features = torch.zeros(0)
-        self._parts: list[dict[str, Tensor]] = []
-        self._merged: dict[str, Tensor] | None = None
+        """Rows for which memory is reserved at once, so that no second copy is needed."""
+        self._columns: dict[str, tuple[Tensor, int]] = {}
+        """Columns and the entries of each that are in use."""
 
     def append(self, view: View, encoded: tuple[Tensor, Tensor], keep: Tensor) -> None:
         """Append the rows of a view: of the cells that a mask (cells,) keeps.
@@ -112,37 +114,31 @@ class FeatureBuffer:
 
     def extend(self, part: Mapping[str, Tensor]) -> None:
         """Append rows by name, as in `tensors`."""
-        rest = dict(part)
-        features = rest.pop("features")
-        rows = self._rows
-        end = rows + len(features)
-        if end > len(self._features):
-            longer = features.new_empty(max(self.planned, 2 * end), features.shape[1])
-            if rows:
-                longer[:rows] = self._features[:rows]
-            self._features = longer
-        self._features[rows:end] = features
-        self._rows = end
-        self._parts.append(rest)
         self.views += len(part["intrinsics"])
-        self._merged = None
+        for name, values in part.items():
+            column, used = self._columns.get(name, (values[:0], 0))
+            end = used + len(values)
+            if end > len(column):
+                size = 2 * end
+                if name in _OF_ROWS:
+                    size = max(size, self.planned)
+                longer = values.new_empty(size, *values.shape[1:])
+                longer[:used] = column[:used]
+                column = longer
+            column[used:end] = values
+            self._columns[name] = column, end
 
     @property
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name, on the buffer's device."""
-        if self._merged is not None:
-            return self._merged
-        rest = {}
-        for name in self._parts[0]:
-            columns = [part[name].cpu() for part in self._parts]
-            rest[name] = torch.cat(columns).to(self.device)
-        self._parts = [rest]
-        self._features = self._features[: self._rows].to(self.device)
-        self._merged = {"features": self._features, **rest}
-        return self._merged
+        tensors = {}
+        for name, (column, used) in self._columns.items():
+            tensors[name] = column[:used].to(self.device)
+            self._columns[name] = tensors[name], used
+        return tensors
 
     def __len__(self) -> int:
-        return self._rows
+        return self._columns["features"][1]
 
     @property
     def starts(self) -> Tensor:
