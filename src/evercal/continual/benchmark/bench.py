@@ -10,8 +10,8 @@
     OUT/runs/STRATEGY-SEED/       store of a run in progress, removed when the run is complete
     OUT/runs/first-SCENE-SEED/    the first scene, shared by all networks
 
-An interrupted run goes on where it was, a minute earlier at most. Several processes may work in one folder:
-each takes runs that no other has.
+An interrupted run goes on where it was, a minute earlier at most. Several processes may work in
+one folder: each takes runs that no other has.
 """
 
 import json
