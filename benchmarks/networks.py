@@ -35,7 +35,19 @@ BOUNDED = (*FILLED, "joint", "finetune")
 """The same beside joint training and fine-tuning, the best and the worst case."""
 CONTROLS = ("evercal", "evercal_network", "joint", "isolation", "finetune")
 """Strategies without a method of continual learning."""
-PAPER = ("sars_spdd", "joint", "finetune", "icarl", "buff_cs", "gec")
+PAPER = (
+    "sars_spdd",
+    "joint",
+    "finetune",
+    "icarl",
+    "buff_cs",
+    "gec",
+    "gdr",
+    "er",
+    "sars_spdd_filled",
+    "reservoir_spdd",
+    "sars_reprojection",
+)
 """Strategies of the paper's table."""
 
 

@@ -179,9 +179,8 @@ def select_sars(
     does not count the new frame. A closest pair always ties, and the older of the two leaves.
     With a buffer of one frame, every accepted frame replaces the one before.
 
-    At r = 0.5 few frames are selected. With r below the step from frame to frame, the closest pair
-    is mostly the two newest frames, so a full buffer follows the camera and covers little of its
-    path. ``fill`` avoids both.
+    At r = 0.5 few frames are selected. With r below the step from frame to frame, a full buffer
+    follows the camera and covers little of its path. ``fill`` avoids both.
 
     Args:
         positions_m: ``(n, 3)`` camera positions, metres.
@@ -199,9 +198,8 @@ def select_sars(
     options = options or SarsOptions()
     if capacity < 0:
         raise ValueError(f"capacity is {capacity}; it is a number of frames >= 0")
-    space = PoseSpace.of(
-        positions_m, quaternions_wxyz, options.rotation_weight, options.unit
-    )
+    weight = options.rotation_weight
+    space = PoseSpace.of(positions_m, quaternions_wxyz, weight, options.unit)
     radius = options.radius
     if options.fill:
         radius = _filling_radius(space, capacity, 1e-5)
