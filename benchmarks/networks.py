@@ -35,6 +35,15 @@ BOUNDED = (*FILLED, "joint", "finetune")
 """The same beside joint training and fine-tuning, the best and the worst case."""
 CONTROLS = ("evercal", "evercal_network", "joint", "isolation", "finetune")
 """Strategies without a method of continual learning."""
+AT_480 = (
+    "sars_spdd_filled",
+    "reservoir_spdd",
+    "sars_reprojection",
+    "er",
+    "gdr",
+    "gec",
+)
+"""Strategies of experiment D."""
 PAPER = (
     "sars_spdd",
     "joint",
@@ -107,6 +116,8 @@ def experiments(
         "memory": memory,
         "b": [head, replace(head, compared=tuned_head)],
         "c": [unseen, replace(unseen, compared=chosen(["evercal"]), seeds="0")],
+        "d": at_480(unseen, data / "sim-unseen-480", out / "networks-d"),
+        "share": shares(gate, out),
         "real": [replace(real, steps=2 * STEPS)],
         "paper": [
             replace(
@@ -119,6 +130,29 @@ def experiments(
     }
 
 
+def at_480(unseen: Experiment, data: Path, out: Path) -> Sequence[Experiment]:
+    """Return experiment C on rooms of 640x480 pixels: joint training first, its gate."""
+    gate = replace(
+        unseen, data=data, out=out, short_side=480, compared=chosen(["joint"])
+    )
+    return [gate, replace(gate, compared=chosen(AT_480))]
+
+
+def shares(gate: Experiment, out: Path) -> Sequence[Experiment]:
+    """Return runs of SPDD with other shares of replayed rows and weights, on held-out frames."""
+    experiments = []
+    for share in (0.25, 0.5, 1.0, 2.0):
+        trials = []
+        for name in ("sars_spdd", "sars_spdd_filled"):
+            for weight in (3.0, 10.0, 30.0):
+                trial = strategy_named(name).weighted(weight)
+                trials.append(replace(trial, name=f"{name}@{weight:g}"))
+        sweep = replace(gate, compared=tuple(trials), replay=share, held_out=True)
+        named = out / f"networks-share-{share:g}"
+        experiments.append(replace(sweep, seeds="0", out=named))
+    return experiments
+
+
 def run(
     names: Positional[tuple[str, ...]],
     data: Path = Path("runs"),
@@ -129,7 +163,8 @@ def run(
 
     Args:
         names: gate (joint training of `a`, whose accuracy decides whether the others are run), a,
-            memory, b, c, real (needs the recordings) and paper (needs a GPU).
+            memory, b, c, d (rooms of 640x480), share (replayed rows of SPDD), real (needs the
+            recordings) and paper (needs a GPU).
         data: Folder of the rooms, rendered with `python -m rooms SUITE --out DATA/SUITE`.
         out: Folder of results.
         device: Device of the networks: auto, cpu or cuda.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from evercal.cli import bench as verb
 from evercal.continual.benchmark.results import STRATEGIES, read, read_frames
 from evercal.continual.learning.presets import short_side
+from evercal.errors import InputError
 from evercal.recordings import generic
 
 
@@ -120,6 +122,11 @@ def test_options_of_the_backbone_of_the_paper():
     changed = replace(whole.fit, batch=2048, replay_batch=2048)
     assert part == replace(whole, fit=changed)
     assert verb.Bench("sim-mini", batch=512)._stage(0).fit.replay_batch == 256
+    twice = verb.Bench("sim-mini", batch=512, replay=2.0)._stage(0)
+    assert (twice.fit.batch, twice.fit.replay_batch) == (512, 1024)
+    for share in (0.0, -1.0, math.nan, 1e9):
+        with pytest.raises(InputError, match="--replay"):
+            verb.Bench("sim-mini", replay=share)._stage(0)
     shared = verb.Bench("sim-mini", backbone="paper", offsets="shared")._stage(0)
     assert (shared.head.offsets, shared.head.centres) == ("shared", "fixed")
 

@@ -56,6 +56,8 @@ class Bench(args.Verb, Training):
     """Training effort per stage; paper needs a GPU."""
     memory: Annotated[str, arg(metavar="SHARE|BYTES")] = "10%"
     """Keyframes to keep of a scene: a share of its frames (10%) or bytes (5MB)."""
+    short_side: args.Count = None
+    """Short side of the working images, pixels. Default: 240, and up to 480 with preset paper."""
     held_out: bool = False
     """Evaluate on a fifth of the training frames instead of the test frames, to choose settings."""
     tune: bool = False
@@ -86,7 +88,7 @@ class Bench(args.Verb, Training):
             strategies,
             seeds,
             self.order,
-            short_side(self.preset, frames),
+            self.short_side or short_side(self.preset, frames),
             settings={"suite": self.suite, "poses": poses, "judged": judged},
             device=self.device,
         )

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 LEAST_BATCH = 64
 """Smallest number of rows in a step that learns anything."""
+MOST_REPLAY = 100
+"""Maximum number of replayed rows of a step for each new one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +38,9 @@ class Training:
     steps: args.Count = None
     """Optimiser steps of a scene. Default: those of the preset."""
     batch: args.Count = None
-    """Rows of the new scene in a step; replayed rows keep the preset's proportion. Default: those
-    of the preset."""
+    """Rows of the new scene in a step. Default: those of the preset."""
+    replay: Annotated[float | None, args.shown("SHARE")] = None
+    """Replayed rows of a step, as a share of the new ones. Default: that of the preset."""
     device: args.Device = "auto"
     plugin: Annotated[Path | None, args.shown("FILE.py")] = None
     """Python file of your own strategies (see examples/my_strategy.py)."""
@@ -74,11 +77,16 @@ class Training:
         stage = BACKBONES[backbone](stage)
         fit = stage.fit
         batch = self.batch or fit.batch
+        replay = self.replay
+        if replay is None:
+            replay = fit.replay_batch / fit.batch
+        if not 0 < replay <= MOST_REPLAY:
+            raise InputError(f"--replay {replay:g}: give a share up to {MOST_REPLAY}")
         fit = dataclasses.replace(
             fit,
             iterations=self.steps or fit.iterations,
             batch=batch,
-            replay_batch=fit.replay_batch * batch // fit.batch,
+            replay_batch=round(replay * batch),
         )
         head = dataclasses.replace(
             stage.head,
