@@ -12,14 +12,15 @@ from evercal.choices import FormatName
 from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.recordings.frame import Recording, with_images
+from evercal.recordings.images import files_in
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.frame_names import FrameNames
-from evercal.storage.text_files import few, named_errors, natural_key
+from evercal.storage.text_files import few, named_errors
 from evercal.typing import PathLike, Strings
 
 FRAMES = ("base_frame", "gripper_frame", "camera_frame")
 """Fields of `ReadOptions` that name frames, for all formats that do not choose by them."""
-_ARCHIVES = {".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar"}
+_ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar")
 """Endings of archives."""
 
 
@@ -110,17 +111,16 @@ def naming_archives(path: Path) -> Iterator[None]:
         yield
     except InputError as error:
         folder = next(place for place in (path, *path.parents) if place.is_dir())
+        wanted = {path, *path.parents}
         archives = []
-        for file in folder.glob("*"):
+        for file in files_in(folder, _ARCHIVES):
             content = folder / file.name.partition(".")[0]
-            if file.suffix.lower() not in _ARCHIVES or content.exists():
-                continue
-            if folder == path or path in (file, content) or content in path.parents:
+            is_near = folder == path or not wanted.isdisjoint((file, content))
+            if is_near and not content.exists():
                 archives.append(file.name)
         if not archives:
             raise
-        names = few(sorted(archives, key=natural_key))
-        text = f"{error}; not unpacked: {names}; unpack in {folder}"
+        text = f"{error}; not unpacked: {few(archives)}; unpack in {folder}"
         raise InputError(text) from None
 
 

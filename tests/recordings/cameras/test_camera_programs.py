@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evercal.recordings.cameras.camera_file import read_camera
-from evercal.recordings.cameras.radial_models import RADIAL_MODELS
+from evercal.recordings.cameras.radial_models import image_radius
 
 from ..checks import refused
 from .test_camera_file import CAMERA, FLAT, MESSAGE, SIZE, D, written
@@ -155,7 +155,7 @@ cam0:
     assert camera.model == "fisheye"
     angles = np.deg2rad(np.linspace(1, 60, 30))
     points = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], -1)
-    radii = focal * RADIAL_MODELS[kind].radius(angles, *own)
+    radii = focal * image_radius(kind, angles, own)
     np.testing.assert_allclose(camera.project(points)[:, 0] - 320.0, radii, atol=0.01)
     bent = text.replace("coeffs: []", "coeffs: [0.1, 0.0, 0.0, 0.0]")
     refused("no other distortion", read_camera, written(tmp_path, bent))

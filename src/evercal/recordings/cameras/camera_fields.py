@@ -16,13 +16,7 @@ from evercal.geometry.camera import COEFFICIENT_COUNTS, COEFFICIENTS
 from evercal.recordings.cameras.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.poses.row_files import by_alias, is_number
 from evercal.storage.text_files import few
-from evercal.typing import Array, Floats, JsonObject, Record
-
-Fields = Record
-"""Values by name."""
-Size = tuple[int, int]
-"""Width and height, pixels."""
-
+from evercal.typing import Array, Floats, JsonObject, Record, Size
 
 _NAMES = by_alias("""
 camera_matrix: cameramatrix intrinsicmatrix mtx k
@@ -68,7 +62,7 @@ _PINHOLE = COEFFICIENTS["pinhole"]
 DISTORTION = ("distortion_coefficients", *_PINHOLE)
 """Names of fields that hold distortion."""
 _UNIQUE = {*_NAMES.values(), *_PINHOLE}
-"""Fields that may be stated once."""
+"""Record that may be stated once."""
 _CAMERA_INFO = {
     "rectificationmatrix",
     "projectionmatrix",
@@ -109,7 +103,7 @@ def field_name(key: object) -> str:
     return _NAMES.get(plain, plain)
 
 
-def named_fields(data: Fields) -> JsonObject:
+def named_fields(data: Record) -> JsonObject:
     """Values by `field_name`; ValueError if two keys are the same field."""
     keys = {}
     fields = {}
@@ -122,7 +116,7 @@ def named_fields(data: Fields) -> JsonObject:
     return fields
 
 
-def camera_of(data: Fields, size: Size | None) -> Camera:
+def camera_of(data: Record, size: Size | None) -> Camera:
     """One camera from its fields.
 
     `size` is (width, height) in pixels of images, for fields without a size. ValueError: they are
@@ -178,7 +172,7 @@ def _model_kind(model: object) -> str:
     return kind
 
 
-def _of_radial_model(kind: str, fields: Fields, size: tuple[Any, Any]) -> Camera:
+def _of_radial_model(kind: str, fields: Record, size: tuple[Any, Any]) -> Camera:
     """As Kalibr states it: parameters before the focal lengths, or the one of `fov` after them."""
     numbers = numbers_of(fields.get("camera_matrix"), "intrinsics")
     name = "distortion_coefficients"
@@ -187,7 +181,7 @@ def _of_radial_model(kind: str, fields: Fields, size: tuple[Any, Any]) -> Camera
     if kind == "fov":
         numbers = [*distortion, *numbers]
         distortion = []
-    names = (*RADIAL_MODELS[kind].parameters, "fx", "fy", "cx", "cy")
+    names = (*RADIAL_MODELS[kind], "fx", "fy", "cx", "cy")
     if len(numbers) != len(names) or any(distortion):
         expected = f"a camera of model {kind} has {', '.join(names)}"
         raise ValueError(
@@ -199,7 +193,7 @@ def _of_radial_model(kind: str, fields: Fields, size: tuple[Any, Any]) -> Camera
     return nearest_fisheye(kind, parameters, (width, height), (fx, fy), (cx, cy))
 
 
-def _distortion(fields: Fields, model: str) -> Floats | None:
+def _distortion(fields: Record, model: str) -> Floats | None:
     """Coefficients in OpenCV's order; None if there is no field of them."""
     names = COEFFICIENTS[model]
     stated = [name for name in _PINHOLE if fields.get(name)]
@@ -239,7 +233,7 @@ def _refuse_other_models(models: Record, distortion: Floats) -> None:
             )
 
 
-def _matrix(fields: Fields, data: Fields) -> Array:
+def _matrix(fields: Record, data: Record) -> Array:
     """(3, 3) intrinsic matrix."""
     names = ("fx", "fy", "cx", "cy")
     if "camera_matrix" in fields:
@@ -276,7 +270,7 @@ def _matrix_of(fx: float, fy: float, cx: float, cy: float) -> Array:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def _size(fields: Fields, data: Fields, size: Size | None) -> tuple[Any, Any]:
+def _size(fields: Record, data: Record, size: Size | None) -> tuple[Any, Any]:
     """Width and height in pixels, or `size` if no field states either."""
     missing = [name for name in ("image_width", "image_height") if name not in fields]
     stated = fields.get("image_size")
@@ -296,7 +290,7 @@ def _size(fields: Fields, data: Fields, size: Size | None) -> tuple[Any, Any]:
     return width, height
 
 
-def _refuse_unknown(data: Fields) -> None:
+def _refuse_unknown(data: Record) -> None:
     """Refuse numbers that may change where a point lies in the image."""
     for key, value in data.items():
         if field_name(key) in _KNOWN or _HARMLESS.search(_plain(key)):
@@ -326,7 +320,7 @@ def _is_matrix(key: object, value: object, count: int) -> bool:
     return min(map(np.size, value)) > 2
 
 
-def _binned(camera: Camera, fields: Fields) -> Camera:
+def _binned(camera: Camera, fields: Record) -> Camera:
     """The camera of combined pixels: ROS states intrinsics and size of the sensor before that."""
     across = max(1, int(fields.get("binningx") or 1))
     down = max(1, int(fields.get("binningy") or 1))
@@ -350,7 +344,7 @@ def _refuse_misfit(camera: Camera) -> None:
     )
 
 
-def _keys(data: Fields) -> str:
+def _keys(data: Record) -> str:
     return few([str(key) for key in data], most=10)
 
 

@@ -14,8 +14,6 @@ from evercal.geometry import Camera
 from evercal.recordings.cameras.camera_fields import (
     DISTORTION,
     EXPECTED,
-    Fields,
-    Size,
     camera_of,
     field_name,
     named_fields,
@@ -23,10 +21,10 @@ from evercal.recordings.cameras.camera_fields import (
 from evercal.recordings.poses.array_files import arrays_as_lists
 from evercal.recordings.poses.row_files import is_number
 from evercal.storage.text_files import documents, few, named_errors, naming, read_text
-from evercal.typing import JsonObject, PathLike
+from evercal.typing import JsonObject, PathLike, Record, Size
 
 _OF_ONE_CAMERA = ("camera_matrix", "fx", "fy", "cx", "cy")
-"""Fields that do not hold for the cameras inside an entry."""
+"""Record that do not hold for the cameras inside an entry."""
 
 
 def read_camera(path: PathLike, size: Size | None = None) -> Camera:
@@ -56,7 +54,7 @@ def check_size(source: str, camera: Camera, size: Size, images: str) -> None:
         )
 
 
-def camera_from_fields(data: Fields, size: Size | None = None) -> Camera:
+def camera_from_fields(data: Record, size: Size | None = None) -> Camera:
     """Build a camera from the fields of a file, or of a ROS message.
 
     The camera may stand inside other fields. Of several, the only one of the images' size is taken.
@@ -75,24 +73,20 @@ def camera_from_fields(data: Fields, size: Size | None = None) -> Camera:
                 cameras[name] = camera_of(entry, size)
         else:
             cameras["outside of these"] = camera_of(entry, size)
-    distinct = set()
-    fitting = set()
-    descriptions = []
-    for name, camera in cameras.items():
-        distinct.add(camera)
-        if camera.size == size:
-            fitting.add(camera)
-        pixels = f"{camera.width}x{camera.height}"
-        descriptions.append(f"{name} ({pixels}, fx {camera.fx:.1f})")
-    choice = fitting or distinct
+    fitting = {camera for camera in cameras.values() if camera.size == size}
+    choice = fitting or {*cameras.values()}
     if len(choice) == 1:
         return choice.pop()
+    descriptions = []
+    for name, camera in cameras.items():
+        pixels = f"{camera.width}x{camera.height}"
+        descriptions.append(f"{name} ({pixels}, fx {camera.fx:.1f})")
     raise ValueError(
         f"holds several cameras: {few(descriptions)}; give a file of the right one"
     )
 
 
-def _undotted(data: Fields) -> JsonObject:
+def _undotted(data: Record) -> JsonObject:
     """ORB-SLAM's `Camera1.fx` as an entry `Camera1`; `Camera.fps` holds for all cameras."""
     groups: dict[str, JsonObject] = {"": {}, "Camera": {}}
     for key, value in data.items():
@@ -105,8 +99,8 @@ def _undotted(data: Fields) -> JsonObject:
     return {**plain, **for_all, **groups}
 
 
-def _entries(data: Fields, around: Fields, name: str) -> Iterator[tuple[str, Fields]]:
-    """Fields of all cameras in nested entries, by name, with numbers that stand around them."""
+def _entries(data: Record, around: Record, name: str) -> Iterator[tuple[str, Record]]:
+    """Record of all cameras in nested entries, by name, with numbers that stand around them."""
     data = _ungrouped(data)
     fields = named_fields(data)
     hidden = set(fields)
@@ -123,8 +117,8 @@ def _entries(data: Fields, around: Fields, name: str) -> Iterator[tuple[str, Fie
         yield from _entries(entry, inherited, inner)
 
 
-def _ungrouped(data: Fields) -> JsonObject:
-    """Fields such as `intrinsics: {fx: ...}` without that group."""
+def _ungrouped(data: Record) -> JsonObject:
+    """Record such as `intrinsics: {fx: ...}` without that group."""
     fields = dict(data)
     for key, value in data.items():
         group = field_name(key) in ("camera_matrix", "distortion_coefficients")
@@ -134,7 +128,7 @@ def _ungrouped(data: Fields) -> JsonObject:
     return fields
 
 
-def _inside(data: Fields, name: str) -> Iterator[tuple[str, Fields]]:
+def _inside(data: Record, name: str) -> Iterator[tuple[str, Record]]:
     """Entries in an entry, and in its lists, by name."""
     for key, value in data.items():
         inner = f"{name}.{key}".lstrip(".")
@@ -146,7 +140,7 @@ def _inside(data: Fields, name: str) -> Iterator[tuple[str, Fields]]:
                     yield f"{inner}[{i}]", entry
 
 
-def fields_of(path: Path, size: Size | None = None) -> Fields:
+def fields_of(path: Path, size: Size | None = None) -> Record:
     """Entries of a camera file, as written; ValueError for other files.
 
     A focal length alone has its principal point in the middle of images of `size`.

@@ -6,64 +6,46 @@ al., An enhanced unified camera model (RA-L 2016) for `eucm`; Usenko et al., The
 camera model (3DV 2018) for `ds`.
 """
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 
 from evercal.geometry import Camera
 from evercal.geometry.distortion import FISHEYE_DEG
-from evercal.typing import Array, Strings
+from evercal.typing import Array
 
 MAX_ERROR_PX = 0.5
 """Largest difference between a model and the fisheye that replaces it, pixels."""
 
 
-class RadialModel(NamedTuple):
-    """A model without other distortion."""
-
-    parameters: Strings
-    """Names of the parameters of `radius`, in order."""
-    radius: Callable[..., Array]
-    """Image radius in focal lengths, of (n,) angles to the axis and parameters."""
-
-
-def _fov(angle: Array, omega: float) -> Array:
-    if not omega:
-        return np.tan(angle)
-    half = np.tan(omega / 2)
-    tangent = 2 * np.tan(angle) * half
-    return np.arctan(tangent) / omega
+RADIAL_MODELS = {
+    "fov": ("omega",),
+    "omni": ("xi",),
+    "eucm": ("alpha", "beta"),
+    "ds": ("xi", "alpha"),
+}
+"""Parameters of the models by their names at Kalibr and COLMAP."""
 
 
-def _omni(angle: Array, xi: float) -> Array:
-    return np.sin(angle) / (np.cos(angle) + xi)
+def image_radius(name: str, angle: Array, parameters: Sequence[float]) -> Array:
+    """Image radius in focal lengths, of (n,) angles to the axis."""
+    if name == "fov":
+        (omega,) = parameters
+        tangent = 2 * np.tan(angle) * np.tan(omega / 2)
+        return np.arctan(tangent) / omega
+    named = dict(zip(RADIAL_MODELS[name], parameters, strict=True))
+    return _by_spheres(angle, **named)
 
 
-def _eucm(angle: Array, alpha: float, beta: float) -> Array:
-    cosine = np.cos(angle)
-    sine = np.sin(angle)
-    squared = beta * sine**2 + cosine**2
-    distance = np.sqrt(squared)
-    depth = alpha * distance + (1 - alpha) * cosine
-    return sine / depth
-
-
-def _ds(angle: Array, xi: float, alpha: float) -> Array:
+def _by_spheres(
+    angle: Array, xi: float = 0.0, alpha: float = 0.0, beta: float = 1.0
+) -> Array:
+    """Two spheres with centres xi apart; `omni` has one, and that of `eucm` is an ellipsoid."""
     sine = np.sin(angle)
     shifted = xi + np.cos(angle)
-    distance = np.sqrt(sine**2 + shifted**2)
-    depth = alpha * distance + (1 - alpha) * shifted
+    squared = beta * sine**2 + shifted**2
+    depth = alpha * np.sqrt(squared) + (1 - alpha) * shifted
     return sine / depth
-
-
-RADIAL_MODELS = {
-    "fov": RadialModel(("omega",), _fov),
-    "omni": RadialModel(("xi",), _omni),
-    "eucm": RadialModel(("alpha", "beta"), _eucm),
-    "ds": RadialModel(("xi", "alpha"), _ds),
-}
-"""Models by their names at Kalibr and COLMAP."""
 
 
 def nearest_fisheye(
@@ -80,12 +62,11 @@ def nearest_fisheye(
     Raises:
         ValueError: No fisheye is within `MAX_ERROR_PX`.
     """
-    radius = RADIAL_MODELS[name].radius
     last_pixel = np.array(size) - 1
     corner = np.maximum(centre, last_pixel - centre)
     largest = np.hypot(*(corner / focal)) * 1.01
     angles = np.deg2rad(np.linspace(0.05, FISHEYE_DEG, 400))
-    radii = radius(angles, *parameters)
+    radii = image_radius(name, angles, parameters)
     steps = np.diff(radii, append=np.inf)
     rising = np.logical_and.accumulate(steps > 0)
     in_image = rising & np.isfinite(radii) & (radii <= largest)

@@ -28,7 +28,6 @@ from evercal.recordings.images import first_size
 from evercal.recordings.poses.row_files import is_number
 from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import named_errors, path_inside, read_text
-from evercal.typing import Size
 
 _LISTS = ("dataset_train.txt", "dataset_test.txt")
 """Lists of training and test images."""
@@ -104,19 +103,11 @@ def _cameras(root: Path, names: list[str], file: Path | None) -> dict[str, Camer
             f"{root}: states no intrinsics; give `camera` (a 3x3 matrix as text, JSON or YAML), or"
             f" put {file.name} there"
         )
-    with named_errors(file, "reconstruction"):
-        return _cameras_of(file, size)
-
-
-def _stem(name: str) -> str:
-    """Name of an image without its ending: lists name .png, reconstructions .jpg."""
-    return name.rpartition(".")[0]
-
-
-def _cameras_of(file: Path, size: Size) -> dict[str, Camera]:
-    """The camera of each image of a reconstruction."""
     cameras = {}
-    with file.open(encoding="utf-8-sig") as stream:
+    with (
+        named_errors(file, "reconstruction"),
+        file.open(encoding="utf-8-sig") as stream,
+    ):
         lines = filter(str.strip, stream)
         if not next(lines, "").startswith("NVM_V3"):
             raise ValueError("begins with NVM_V3")
@@ -124,3 +115,8 @@ def _cameras_of(file: Path, size: Size) -> dict[str, Camera]:
             name, focal, *_ = line.split()
             cameras[_stem(name)] = centred_camera(float(focal), size)
     return cameras
+
+
+def _stem(name: str) -> str:
+    """Name of an image without its ending: lists name .png, reconstructions .jpg."""
+    return name.rpartition(".")[0]

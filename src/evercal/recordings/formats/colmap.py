@@ -230,7 +230,7 @@ def _camera(model: str, size: Size, numbers: Array) -> Camera:
     centre = (values["cx"] - 0.5, values["cy"] - 0.5)
     kind = model.lower()
     if kind in RADIAL_MODELS:
-        parameters = [values[key] for key in RADIAL_MODELS[kind].parameters]
+        parameters = [values[key] for key in RADIAL_MODELS[kind]]
         return nearest_fisheye(kind, parameters, size, focal, centre)
     lens = "fisheye" if kind.endswith("fisheye") else "pinhole"
     count = 8 if "k6" in values else 4

@@ -51,6 +51,7 @@ def load(root: Path) -> Recording:
     with named_errors(file, "scene file"):
         frames = of_format(data, _FORMAT, _VERSION, partial(_frames, root))
         names = FrameNames.from_dict(data.get("frame_names", {}))
+        notes = tuple(map(str, data.get("notes", ())))
     name = data.get("name")
     if not isinstance(name, str) or not name:
         name = root.resolve().name
@@ -59,7 +60,7 @@ def load(root: Path) -> Recording:
         tuple(frames["train"]),
         tuple(frames["test"]),
         data.get("untracked", 0),
-        notes=tuple(data.get("notes", ())),
+        notes=notes,
         metric=data.get("unit") != "unknown",
         frames=names,
     )
@@ -67,15 +68,12 @@ def load(root: Path) -> Recording:
 
 def _frames(root: Path, data: Record) -> dict[Split, list[Frame]]:
     entries = data.get("frames")
-    notes = data.get("notes", [])
     if not isinstance(entries, list) or not entries:
         raise ValueError("'frames' is a list with at least one frame")
     if not isinstance(data.get("untracked", 0), int):
         raise ValueError(f"'untracked' is a count, got {data['untracked']!r}")
     if data.get("unit", "metres") not in ("metres", "unknown"):
         raise ValueError(f"'unit' is 'metres' or 'unknown', got {data['unit']!r}")
-    if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
-        raise ValueError(f"'notes' is a list of sentences, got {notes!r}")
     cameras = _cameras(data.get("cameras"))
     frames: dict[Split, list[Frame]] = {"train": [], "test": []}
     names = []

@@ -84,9 +84,14 @@ def feature_poses(
 ) -> tuple[RobotPoses, list[str]]:
     """Poses from the (n, k) values of a feature, and notes."""
     names = names_of(info, column)
+    count = values.shape[1]
+    needs_names = options.urdf or options.pose_convention is None
+    if needs_names and len(names) != count:
+        raise InputError(
+            f"{root}: {column}: has {count} numbers and {len(names)} names"
+        )
     if options.urdf:
         return _joint_poses(root, names, values, options)
-    count = values.shape[1]
     notes = []
     with named_errors(f"{root}: {column}", "poses"), asking_for("`pose_convention`"):
         if options.pose_convention is not None:
@@ -96,8 +101,6 @@ def feature_poses(
             if taken < count:
                 used = f" ({', '.join(names[:taken])})" if names else ""
                 notes = [f"the first {taken} of its {count} numbers were taken{used}"]
-        elif len(names) != count:
-            raise ValueError(f"has {count} numbers and {len(names)} names")
         else:
             name, columns = _pose_columns(names, options.gripper_frame)
             convention = pose_convention(name)
@@ -111,14 +114,11 @@ def _joint_poses(
     root: Path, names: list[str], values: Array, options: ReadOptions
 ) -> tuple[RobotPoses, list[str]]:
     assert options.urdf
-    count = values.shape[1]
     source = f"{root}: {STATE}"
-    if len(names) != count:
-        raise InputError(f"{source} has {count} numbers and {len(names)} names")
     with named_errors(source, "names"):
         refuse_repeated(names, "rename the numbers")
     model = RobotModel(options.urdf, options.whole_robot)
-    values = in_radians(model, names, values, [options.pose_convention] * count)
+    values = in_radians(model, names, values, [options.pose_convention] * len(names))
     links = (options.base_frame, options.gripper_frame)
     moved = model.poses(names, values, *links, source)
     return poses_of_arm(moved), moved.notes

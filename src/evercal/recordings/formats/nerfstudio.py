@@ -11,7 +11,7 @@ frames. (Tancik et al., Nerfstudio, SIGGRAPH 2023; its documentation, Data conve
 import math
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +35,7 @@ from evercal.storage.text_files import (
     read_json,
     refuse_repeated,
 )
-from evercal.typing import Array, Record
+from evercal.typing import Array, Record, Size
 
 FILE = "transforms.json"
 """Usual name of the file."""
@@ -56,10 +56,6 @@ _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Numbers of `distortion_params`, in this order."""
 _TOLERANCE = 1e-2
 """Largest deviation of a stated matrix from a rotation."""
-Entry: TypeAlias = Record
-"""Values of the file."""
-Size: TypeAlias = tuple[int, int]
-"""Width and height, pixels."""
 
 
 def frame_note(file: str, metric: bool) -> str:
@@ -160,7 +156,7 @@ def _image_root(file: Path, name: str) -> Path:
     return root
 
 
-def _applied(data: Entry) -> tuple[SE3, float]:
+def _applied(data: Record) -> tuple[SE3, float]:
     scale = _number(data, "applied_scale", 1.0)
     if not scale > 0:
         raise ValueError(f"'applied_scale' is > 0, got {scale}")
@@ -176,7 +172,7 @@ def _applied(data: Entry) -> tuple[SE3, float]:
         return applied.inverse(), scale * size
 
 
-def _frame(root: Path, data: Entry, entry: object, undo: SE3, scale: float) -> Frame:
+def _frame(root: Path, data: Record, entry: object, undo: SE3, scale: float) -> Frame:
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise ValueError("an object with 'file_path' and 'transform_matrix'")
     name = entry["file_path"]
@@ -199,7 +195,7 @@ def _image(root: Path, name: str) -> Path:
     return image
 
 
-def _camera(data: Entry) -> Camera:
+def _camera(data: Record) -> Camera:
     model = data.get("camera_model", "OPENCV")
     if model not in _MODELS:
         raise ValueError(
@@ -242,7 +238,7 @@ def _camera(data: Entry) -> Camera:
     return Camera(size[0], size[1], fx, fy, cx, cy, distortion, kind)
 
 
-def _focal(data: Entry, axis: str, size: float) -> float | None:
+def _focal(data: Record, axis: str, size: float) -> float | None:
     focal = f"fl_{axis}"
     if data.get(focal) is not None:
         return _number(data, focal)
@@ -297,7 +293,7 @@ def _reader(image: Path, stated: Size, source: str) -> tuple[Size, Any]:
     return size, readers[chosen]
 
 
-def _test_names(root: Path, data: Entry, frames: list[str]) -> set[str]:
+def _test_names(root: Path, data: Record, frames: list[str]) -> set[str]:
     name_of = {_image(root, name): name for name in frames}
     test = set()
     for key in ("val_filenames", "test_filenames"):
@@ -322,7 +318,7 @@ def _matrix(value: object, name: str) -> Array:
     return matrix
 
 
-def _number(data: Entry, name: str, default: float | None = None) -> float:
+def _number(data: Record, name: str, default: float | None = None) -> float:
     value: Any = data.get(name, default)
     if not is_real(value) or not math.isfinite(value):
         what = "is missing" if value is None else f"is a number, got {value!r}"

@@ -16,7 +16,7 @@ original pose. It is unknown which poses are more accurate: report results under
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,7 @@ from evercal.recordings.formats.cambridge import numbers_by_image
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.poses.row_files import is_number
 from evercal.storage.text_files import named_errors, read_text
-from evercal.typing import Array
+from evercal.typing import Array, Size
 
 COLOUR_FROM_DEPTH = SE3.from_matrix(
     np.array(
@@ -36,7 +36,6 @@ COLOUR_FROM_DEPTH = SE3.from_matrix(
             [0.99996518, 0.00267651, -0.00790410, -0.02555894],
             [-0.00274093, 0.99996303, -0.00815045, 0.00010110],
             [0.00788199, 0.00817183, 0.99993555, 0.00203183],
-            [0.0, 0.0, 0.0, 1.0],
         ]
     )
 )
@@ -61,52 +60,52 @@ def tracked_recording(
     """
     recorded = []
     for split, images in zip(("train", "test"), splits, strict=True):
-        if poses in ("original", "colour"):
-            frames = _original(root, images, camera, poses == "colour")
-        else:
+        by_motion = poses not in ("original", "colour")
+        views = {}
+        if by_motion:
             file = Path(poses) / f"{name}_{split}.txt"
-            frames = _by_structure_from_motion(root, images, camera, file)
+            views = _by_structure_from_motion(file, camera.size)
+        frames = []
+        for image in images:
+            key = frame_key(image.relative_to(root).as_posix())
+            view = views.get(key)
+            if not by_motion:
+                view = (camera, _original(image, poses))
+            if view and view[1]:
+                frames.append(Frame(key, image, *view))
+        if by_motion and images and not frames:
+            first = images[0].relative_to(root)
+            raise InputError(f"{file}: no frame of {root} is in it, such as {first}")
         recorded.append(tuple(frames))
     train, test = recorded
     untracked = sum(map(len, splits)) - len(train) - len(test)
     return Recording(root.resolve().name, train, test, untracked)
 
 
-def _original(
-    root: Path, images: Sequence[Path], camera: Camera, is_colour: bool
-) -> Iterator[Frame]:
-    for image in images:
-        name = frame_key(image.relative_to(root).as_posix())
-        file = image.with_name(f"{frame_key(image.name)}.pose.txt")
-        matrix = _matrix(file)
-        if np.isfinite(matrix).all():
-            with named_errors(file, "pose"):
-                pose = SE3.from_matrix(matrix, _ROTATION_TOLERANCE)
-            if is_colour:
-                pose @= COLOUR_FROM_DEPTH.inverse()
-            yield Frame(name, image, camera, pose)
+def _original(image: Path, poses: str) -> SE3 | None:
+    """The pose beside an image; None if it is untracked."""
+    file = image.with_name(f"{frame_key(image.name)}.pose.txt")
+    matrix = _matrix(file)
+    if not np.isfinite(matrix).all():
+        return None
+    with named_errors(file, "pose"):
+        pose = SE3.from_matrix(matrix, _ROTATION_TOLERANCE)
+    if poses == "colour":
+        pose @= COLOUR_FROM_DEPTH.inverse()
+    return pose
 
 
-def _by_structure_from_motion(
-    root: Path, images: Sequence[Path], camera: Camera, file: Path
-) -> list[Frame]:
+def _by_structure_from_motion(file: Path, size: Size) -> dict[str, tuple[Camera, SE3]]:
+    """Camera and pose of each image by `frame_key`."""
     _require(file)
     text = read_text(file, "pose file", f"get the folder pgt/sfm of {_SOURCE}")
     poses = {}
     with named_errors(file, "pose file"):
         for name, (*pose, focal) in numbers_by_image(file, text, _LAYOUT).items():
             camera_from_base = SE3(np.array(pose[:4]), np.array(pose[4:]))
-            own = centred_camera(focal, camera.size)
+            own = centred_camera(focal, size)
             poses[frame_key(name)] = (own, camera_from_base.inverse())
-    frames = []
-    for image in images:
-        name = frame_key(image.relative_to(root).as_posix())
-        if name in poses:
-            frames.append(Frame(name, image, *poses[name]))
-    if images and not frames:
-        first = images[0].relative_to(root)
-        raise InputError(f"{file}: no frame of {root} is in it, such as {first}")
-    return frames
+    return poses
 
 
 def frame_key(name: str) -> str:

@@ -106,11 +106,8 @@ def load(root: Path, options: ReadOptions) -> Recording:
         )
     layout = layouts[0]
     train = _frames(root, layout, options)
-    test_layout = layout._replace(
-        poses=layout.poses.replace("train/", "test/"),
-        images=layout.images.replace("train/", "test/"),
-        camera=layout.camera.replace("train/", "test/"),
-    )
+    parts = [part and part.replace("train/", "test/") for part in layout]
+    test_layout = RecordingLayout(*parts)
     if test_layout == layout or not (root / test_layout.poses).exists():
         return train
     test = _frames(root, test_layout, options)

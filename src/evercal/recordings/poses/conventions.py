@@ -8,6 +8,7 @@ Sources: Roboception's documentation of pose formats (ABB, FANUC, KUKA, Yaskawa)
 script manual, RoboDK's converters (Staubli, Kawasaki) and libfranka's reference.
 """
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -131,10 +132,10 @@ KNOWN_CONVENTIONS = (
     f"{', '.join([*CONVENTIONS, *VENDORS])}, fixed_xyz or moving_zyx with any order of axes,"
     f" followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"
 )
-for _first, _second, _third in product("xyz", repeat=3):
-    if _first != _second != _third:
-        _axes = _first + _second + _third
-        _meaning = f"x y z and angles about {_first} {_second} {_third}"
+for _letters in product("xyz", repeat=3):
+    _axes = "".join(_letters)
+    if not re.search(r"(.)\1", _axes):
+        _meaning = f"x y z and angles about {' '.join(_axes)}"
         _fixed = PoseConvention(f"fixed_{_axes}", _axes, f"{_meaning}, fixed axes")
         _moving = PoseConvention(
             f"moving_{_axes}", _axes.upper(), f"{_meaning}, moving axes"
@@ -296,24 +297,21 @@ def _rigid(matrices: Array) -> BoolArray:
 
 
 def _from_matrices(numbers: Array, convention: PoseConvention) -> SE3:
-    stated = "matrix"
     other = "franka"
     order = "column after column"
-    if convention.layout == "columns":
-        stated = "franka"
+    if convention.base == other:
         other = "matrix"
         order = "row after row"
     matrices = matrices_from_numbers(numbers, convention.layout)
     broken = ~_rigid(matrices)
     transposed = matrices_from_numbers(numbers, CONVENTIONS[other].layout)
     if broken.any() and _rigid(transposed).all():
-        _, *modifiers = convention.name.split(":")
-        remedy = ":".join([other, *modifiers])
+        remedy = convention.name.replace(convention.base, other)
         raise ConventionError(f"the matrices are written {order}", remedy)
     _refuse(
         broken,
-        f"no rigid transform as {stated}: the last row is not 0 0 0 1, or the left 3x3 block is no"
-        f" rotation but holds a scale or a reflection",
+        f"no rigid transform as {convention.base}: the last row is not 0 0 0 1, or the left 3x3"
+        f" block is no rotation but holds a scale or a reflection",
     )
     poses = SE3.from_matrix(matrices, _TOLERANCE)
     return SE3(poses.rotation_wxyz, poses.translation_m * convention.metres_per_unit)

@@ -105,11 +105,8 @@ def _readings(
     poses: SE3, pairs: NDArray[np.intp], of_camera: bool
 ) -> tuple[Array, dict[str, Array]]:
     """(n, 3) rotation vectors first_from_second of pairs as stated, and in other readings."""
-    first_frames, second_frames = pairs.T
-    first = poses[first_frames].rotation
-    second = poses[second_frames].rotation
-    stated = (first.inv() * second).as_rotvec()
-    inverse = (first * second.inv()).as_rotvec()
+    stated = _between(poses.rotation, pairs)
+    inverse = _between(poses.inverse().rotation, pairs)
     readings = {}
     if of_camera:
         readings["camera_from_base, the inverse"] = inverse
@@ -118,12 +115,15 @@ def _readings(
     else:
         readings["gripper_from_base, the inverse"] = inverse
     swapped = Rotation.from_quat(poses.rotation_wxyz)
-    first = swapped[first_frames]
-    second = swapped[second_frames]
-    readings["with angles or quaternions in another order"] = (
-        first.inv() * second
-    ).as_rotvec()
+    name = "with angles or quaternions in another order"
+    readings[name] = _between(swapped, pairs)
     return stated, readings
+
+
+def _between(rotation: Rotation, pairs: NDArray[np.intp]) -> Array:
+    """(n, 3) rotation vectors first_from_second of pairs (n, 2)."""
+    first, second = pairs.T
+    return (rotation[first].inv() * rotation[second]).as_rotvec()
 
 
 def measured_pairs(
@@ -149,11 +149,10 @@ def measured_rotation(first: Frame, second: Frame) -> Array | None:
         return None
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     rows = []
-    for nearest, *others in matcher.knnMatch(first_descriptors, second_descriptors, 2):
-        if not others:
-            continue
-        second_nearest = others[0].distance
-        if nearest.distance < RATIO * second_nearest:
+    for nearest, second_nearest in matcher.knnMatch(
+        first_descriptors, second_descriptors, 2
+    ):
+        if nearest.distance < RATIO * second_nearest.distance:
             rows.append((nearest.queryIdx, nearest.trainIdx))
     if len(rows) < MIN_MATCHES:
         return None

@@ -55,13 +55,6 @@ class _Transform(NamedTuple):
     translation: Floats
     """Metres."""
 
-    def is_rigid(self) -> bool:
-        """Whether the numbers are a rotation and a translation."""
-        deviation = abs(float(np.linalg.norm(self.quaternion)) - 1)
-        return bool(
-            deviation < _LENGTH_TOLERANCE and np.isfinite(self.translation).all()
-        )
-
 
 @dataclass
 class _Edge:
@@ -113,8 +106,9 @@ class TfTree:
             q = entry.transform.rotation
             rotation = (q.w, q.x, q.y, q.z)
             translation = (t.x, t.y, t.z)
-            frames = (header.frame_id, entry.child_frame_id)
-            link = _Transform(*frames, stamp, rotation, translation)
+            parent = plain_name(header.frame_id)
+            child = plain_name(entry.child_frame_id)
+            link = _Transform(parent, child, stamp, rotation, translation)
             self._add(link, message.topic.removesuffix("_static"))
         return times
 
@@ -188,17 +182,17 @@ class TfTree:
 
     def _add(self, transform: _Transform, topic: str) -> None:
         """Add a transform of a topic; /tf_static belongs to /tf."""
-        parent = plain_name(transform.parent)
-        child = plain_name(transform.child)
-        if not transform.is_rigid():
+        parent, child, stamp, quaternion, translation = transform
+        deviation = abs(np.linalg.norm(quaternion) - 1)
+        if not deviation < _LENGTH_TOLERANCE or not np.isfinite(translation).all():
             raise InputError(
                 f"{self._source}: tf {parent} -> {child}: quaternion (w x y z)"
-                f" {transform.quaternion}, translation {transform.translation}: no rigid transform;"
+                f" {quaternion}, translation {translation}: no rigid transform;"
                 f" repair the program that publishes it"
             )
         edge = self._edges.setdefault(child, {}).setdefault(topic, _Edge())
-        transforms = edge.static if transform.stamp_s is None else edge.moving
-        transforms.append(transform._replace(parent=parent, child=child))
+        transforms = edge.static if stamp is None else edge.moving
+        transforms.append(transform)
         del transforms[: -self._most]
 
     def _edge(self, child: str) -> _Edge:
