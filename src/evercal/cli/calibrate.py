@@ -11,7 +11,7 @@ from tyro.conf import Positional
 from evercal.choices import MountName
 from evercal.classes import frozen
 from evercal.cli import args
-from evercal.cli.console import numbers, require_writable, say_notes
+from evercal.cli.console import motion, numbers, require_writable, say_notes
 from evercal.errors import InputError
 from evercal.progress import progress_bar
 
@@ -157,22 +157,22 @@ def calibration_lines(
     yield f"{frames}: the {calibration.meaning}{scene}"
     yield f"  translation  {numbers(1000 * pose.translation_m, '+.2f')} mm"
     yield f"  quaternion   {numbers(pose.rotation_wxyz, '+.6f')} wxyz"
-    spread = f"{calibration.sigma_mm:.2f} mm, {calibration.sigma_deg:.3f} deg"
+    spread = motion(calibration.sigma_mm, calibration.sigma_deg)
     yield f"  uncertainty  {spread} (standard deviation per axis)"
     yield from lens_lines(calibration)
     terms = calibration.error_terms
     for term, share in zip(terms, position_shares(terms), strict=True):
         if term.translation_mm >= 0.005 or term.rotation_deg >= 0.0005:
-            part = f"{term.translation_mm:.2f} mm, {term.rotation_deg:.3f} deg: {term.name}"
-            yield f"    of it      {part} ({100 * share:.0f} % of the position's variance)"
+            size = motion(term.translation_mm, term.rotation_deg)
+            part = f"{100 * share:.0f} % of the position's variance"
+            yield f"    of it      {size}: {term.name} ({part})"
     if point:
         yield f"  point        {point.text(calibration.uncertain_pose)}"
     yield from held_out_lines(calibration)
     checks = calibration.checks
     if checks.repeatability_mm is not None:
-        mm = checks.repeatability_mm
-        deg = checks.repeatability_deg
-        yield f"  two halves   of the images differ by {mm:.2f} mm and {deg:.3f} deg"
+        apart = motion(checks.repeatability_mm, checks.repeatability_deg, " and ")
+        yield f"  two halves   of the images differ by {apart}"
     images = calibration.images
     rejected = [image for image in images if not image.used]
     if images:
@@ -187,7 +187,7 @@ def held_out_lines(calibration: "Calibration") -> Iterator[str]:
     checks = calibration.checks
     if checks.held_out_mm is None:
         return
-    error = f"{checks.held_out_mm:.2f} mm and {checks.held_out_deg:.3f} deg"
+    error = motion(checks.held_out_mm, checks.held_out_deg, " and ")
     if checks.held_out_sigmas is not None:
         error += f", {checks.held_out_sigmas:.1f} of their standard deviations"
     yield f"  left out     half of the poses are predicted within {error}"
@@ -237,7 +237,7 @@ def _rig_lines(rig: "Rig", point: args.Point | None) -> Iterator[str]:
         yield from others
     for first, second, pose in rig.relative:
         position = numbers(1000 * pose.pose.translation_m, "+.2f")
-        spread = f"{pose.sigma_mm:.2f} mm and {pose.sigma_deg:.3f} deg"
+        spread = motion(pose.sigma_mm, pose.sigma_deg, " and ")
         yield (
             f"{first}_from_{second}: {position} mm, standard deviation at most {spread}"
             " (independent errors assumed)"

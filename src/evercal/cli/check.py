@@ -9,6 +9,7 @@ from tyro.conf import Positional, arg
 
 from evercal.classes import frozen
 from evercal.cli import args
+from evercal.cli.console import motion
 from evercal.errors import InputError
 from evercal.progress import progress_bar
 from evercal.reports.answers import check_record, shift_dict
@@ -174,8 +175,9 @@ class Check(args.Verb):
 
 def shift_line(shift: "Shift") -> str:
     """The answer in one sentence."""
-    size = f"{shift.translation_mm:.2f} mm and {shift.rotation_deg:.3f} deg"
-    spread = f"standard deviation {shift.sigma_mm:.2f} mm and {shift.sigma_deg:.3f} deg per axis"
+    size = motion(shift.translation_mm, shift.rotation_deg, " and ")
+    sigma = motion(shift.sigma_mm, shift.sigma_deg, " and ")
+    spread = f"standard deviation {sigma} per axis"
     confidence = f"confidence {100 * shift.confidence:.1f} %"
     if shift.moved:
         return f"The camera has moved by {size} ({confidence}; {spread}). Calibrate it again."

@@ -42,9 +42,12 @@ def table(rows: Sequence[Mapping[str, object]]) -> list[str]:
     return [tabulate(list(rows), headers="keys", colalign=align, disable_numparse=True)]
 
 
-def length(mm: float | None) -> str:
-    """A length before an angle; nothing where its unit is unknown."""
-    return "" if mm is None else f"{mm:.2f} mm, "
+def motion(mm: float | None, deg: float | None, between: str = ", ") -> str:
+    """A length and an angle; the angle alone where the unit of length is unknown."""
+    angle = f"{deg:.3f} deg"
+    if mm is None:
+        return angle
+    return f"{mm:.2f} mm{between}{angle}"
 
 
 def numbers(values: "Iterable[float]", form: str) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 from evercal.classes import frozen
 from evercal.cli import args
-from evercal.cli.console import length, size, table
+from evercal.cli.console import motion, size, table
 
 MEMORY_FILES = ("keyframes.safetensors", "state.safetensors")
 """Files of the keyframes: of a scene of a map, and of a store of networks."""
@@ -126,8 +126,8 @@ def adjusted_row(scene: str, adjusted: dict[str, Any]) -> dict[str, object]:
     return {
         "bundle adjustment": scene,
         "median residual": "-" if residual is None else f"{residual:.2f} px",
-        "error of stated poses": f"{length(sigma)}{adjusted['pose_sigma_deg']:.3f} deg",
-        "common transform": f"{length(shift_mm)}{rotation_deg:.3f} deg",
+        "error of stated poses": motion(sigma, adjusted["pose_sigma_deg"]),
+        "common transform": motion(shift_mm, rotation_deg),
         "focal length": f"{adjusted['focal_percent']:+.2f} %",
         "poses left out": len(adjusted["wrong_poses"]),
         "untracked": len(adjusted.get("untracked", ())),

@@ -134,17 +134,15 @@ def _coverage_lines(covered: "Coverage") -> Iterator[str]:
 
 
 def _next_records(views: "NextViews") -> list[dict[str, object]]:
+    from evercal.geometry import pose_to_dict
+
     records = []
     for i, pose in enumerate(views.poses):
-        records.append(
-            {
-                "row": int(views.index[i]) + 1,
-                "translation_m": pose.translation_m.tolist(),
-                "quaternion_wxyz": pose.rotation_wxyz.tolist(),
-                "sigma_mm": views.sigma_mm[i + 1],
-                "sigma_deg": views.sigma_deg[i + 1],
-            }
-        )
+        record = pose_to_dict(pose) or {}
+        record["row"] = int(views.index[i]) + 1
+        record["sigma_mm"] = views.sigma_mm[i + 1]
+        record["sigma_deg"] = views.sigma_deg[i + 1]
+        records.append(record)
     return records
 
 

@@ -9,7 +9,7 @@ from tyro.conf import Positional
 
 from evercal.classes import frozen
 from evercal.cli import args
-from evercal.cli.console import length, size
+from evercal.cli.console import motion, size
 from evercal.errors import InputError
 from evercal.progress import Bars
 
@@ -57,18 +57,15 @@ class Refresh(args.Verb):
             self.answer({"scene": self.undo, "undone": True}, line)
             return 0
         with Bars(self.log) as bars:
-            recording = _recording(self.images)
-            if recording:
-                camera = None
-                if recording.train:
-                    first = recording.train[0].camera
-                    shape = first.size
-                    camera = args.stated_camera(self.camera, shape)
-                report = cell.refresh(recording, camera=camera, on_progress=bars.step)
-            else:
-                files = image_files(self.images)
-                camera = args.camera_for(self.camera, files)
-                report = cell.refresh(files, camera=camera, on_progress=bars.step)
+            images = _recording(self.images)
+            camera = None
+            if not images:
+                images = image_files(self.images)
+                camera = args.camera_for(self.camera, images)
+            elif images.train:
+                shape = images.train[0].camera.size
+                camera = args.stated_camera(self.camera, shape)
+            report = cell.refresh(images, camera=camera, on_progress=bars.step)
         then = ("refresh", self.store, "--undo", report.scene)
         self.answer(dataclasses.asdict(report), *_lines(report), then=then)
         return 0
@@ -92,8 +89,8 @@ def _lines(report: "RefreshReport") -> Iterator[str]:
     yield f"  landmarks    {gone:,} of {checked:,} in view are gone ({share})"
     keyframes = f"{report.keyframes_left} replaced, {report.keyframes_added} new"
     yield f"  keyframes    {keyframes}; {size(report.memory_bytes)}"
-    shift = f"{length(report.shift_mm)}{report.shift_deg:.3f} deg"
-    sigma = f"{length(report.shift_sigma_mm)}{report.shift_sigma_deg:.3f} deg"
+    shift = motion(report.shift_mm, report.shift_deg)
+    sigma = motion(report.shift_sigma_mm, report.shift_sigma_deg)
     outside = f"{report.verified} images outside the map"
     yield f"  base frame   moved by {shift} (standard deviation {sigma}; {outside})"
     for name, reason in list(report.left_out.items())[:_LISTED]:

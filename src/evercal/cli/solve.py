@@ -10,7 +10,7 @@ from evercal.choices import MountName
 from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.calibrate import calibration_lines
-from evercal.cli.console import require_writable, say_notes
+from evercal.cli.console import motion, require_writable, say_notes
 
 if TYPE_CHECKING:
     from evercal.calibration.calibration import Calibration
@@ -117,7 +117,7 @@ class Solve(args.Verb):
 def _check_lines(calibration: "Calibration") -> Iterator[str]:
     checks = calibration.checks
     camera = calibration.camera
-    residual = f"{checks.residual_mm:.2f} mm, {checks.residual_deg:.3f} deg"
+    residual = motion(checks.residual_mm, checks.residual_deg)
     yield f"  residuals    {residual} (root mean square)"
     if checks.corner_sigma_px is not None:
         yield f"  corners      {checks.corner_sigma_px:.2f} px (standard deviation)"

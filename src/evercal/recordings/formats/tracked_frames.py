@@ -61,9 +61,9 @@ def tracked_recording(
     recorded = []
     for split, images in zip(("train", "test"), splits, strict=True):
         by_motion = poses not in ("original", "colour")
+        file = Path(poses) / f"{name}_{split}.txt"
         views = {}
         if by_motion:
-            file = Path(poses) / f"{name}_{split}.txt"
             views = _by_structure_from_motion(file, camera.size)
         frames = []
         for image in images:

@@ -107,7 +107,7 @@ def load(root: Path, options: ReadOptions) -> Recording:
     layout = layouts[0]
     train = _frames(root, layout, options)
     parts = [part and part.replace("train/", "test/") for part in layout]
-    test_layout = RecordingLayout(*parts)
+    test_layout = RecordingLayout._make(parts)
     if test_layout == layout or not (root / test_layout.poses).exists():
         return train
     test = _frames(root, test_layout, options)
