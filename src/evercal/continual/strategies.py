@@ -19,6 +19,7 @@ from evercal.continual.methods.penalties import (
     BoundedByTeacher,
     Distillation,
     OldOutput,
+    OldPixels,
     Relations,
 )
 from evercal.continual.methods.preconditioning import PreconditionedReplay
@@ -86,6 +87,7 @@ _METHODS: dict[str, Method | None] = {
     "sars_spdd": Replay("sars", Distillation(), weight=10.0),
     "sars_spdd_filled": Replay("sars_filled", Distillation(), weight=10.0),
     "reservoir_spdd": Replay("reservoir", Distillation(), weight=10.0),
+    "sars_pixels": Replay("sars_filled", OldPixels(), weight=3.0),
     "sars_old_output": Replay("sars", OldOutput()),
     "sars_reprojection": Replay("sars", weight=3.0),
     "isolation": Isolation(),
@@ -100,6 +102,7 @@ _SOURCES = {
     "co2l": "Cha et al., Co2L's relation distillation, ICCV 2021, ported to points",
     "sars_spdd": "Li et al., Continual Hand-Eye Calibration, arXiv 2604.15814, Algorithms 1 and 2",
     "sars_spdd_filled": "the same with a radius that fills the memory",
+    "sars_pixels": "this project: filled SARS with old points in pixels in place of SPDD",
     "reservoir_spdd": "Li et al., SPDD on a reservoir of frames",
     "sars_old_output": "Li et al., SARS with the distillation of iCaRL",
     "sars_reprojection": "Li et al., SARS with reprojection alone",

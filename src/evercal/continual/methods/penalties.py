@@ -15,6 +15,7 @@ from evercal.continual.networks.loss import (
     LossOptions,
     fixed_clamp_loss,
     reprojection_loss,
+    surface_loss,
 )
 
 PX_PER_M = 50.0
@@ -163,6 +164,23 @@ class AnchoredReprojection(Penalty):
         distance = _distance_m(student, teacher)
         anchored = torch.where(error < self.teacher_limit_px, distance, 0.0)
         return cost.mean() + self.px_per_m * anchored.mean()
+
+
+@frozen
+class OldPixels(Penalty):
+    """Reprojection loss, and distance to the teacher's points in pixels at their depth.
+
+    A metre counts as much as it moves the image, unlike in SPDD, iCaRL and Buff-CS. So distance and
+    reprojection have one unit, and half of each needs no further weight.
+    """
+
+    def __call__(
+        self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
+    ) -> Tensor:
+        """Compute the loss in pixels."""
+        known = teacher.points.detach()
+        distance = surface_loss(student.points, known, rows.target, tau_px)
+        return 0.5 * distance.mean() + 0.5 * _reprojection(student, rows, tau_px)
 
 
 @frozen
