@@ -1,4 +1,4 @@
-"""Variants of SARS + SPDD as strategies, for `evercal bench SUITE --plugin examples/replay_ideas.py`.
+"""Variants of SARS + SPDD for `evercal bench SUITE --plugin examples/replay_ideas.py`.
 
 Each fills the memory and changes the loss of replayed rows. Their rows on held-out frames are in
 research/network-trials.md; the best one is the strategy `sars_pixels`.
