@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from evercal.continual.benchmark import comparison
 from evercal.continual.benchmark.comparison import Threshold
 from evercal.continual.benchmark.results import Table
+from evercal.continual.learning.checkpoint import CURVE
 from evercal.typing import JsonObject, Strings
 
 COLOURS = (
@@ -41,6 +42,8 @@ LINES = "figure.svg"
 """File of accuracies over stages."""
 BARS = "bars.svg"
 """File of final accuracies."""
+CURVES = "training.svg"
+"""File of loss and inliers of every training."""
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -103,6 +106,32 @@ def draw_figures(
             panel.set_xticks([])
     _save(over_stages, panels[0], folder / LINES)
     _save(final, bar_panels[0], folder / BARS)
+
+
+def draw_curves(folder: Path) -> bool:
+    """Draw loss and inliers over the steps of every training; False if none has a curve."""
+    curves = sorted(folder.glob(f"training/*/{CURVE}"))
+    figure = new_figure(9.0, 3.4)
+    panels = [figure.add_subplot(1, 2, number) for number in (1, 2)]
+    colours: dict[str, str] = {}
+    for path in curves:
+        curve = pd.read_csv(path)
+        strategy = path.parent.name.partition("-")[0]
+        label = f"_{strategy}"
+        if strategy not in colours:
+            colours[strategy] = COLOURS[len(colours) % len(COLOURS)]
+            label = strategy
+        for panel, column in zip(panels, ("loss", "inlier_share"), strict=True):
+            style: JsonObject = {"color": colours[strategy], "label": label}
+            panel.plot(curve["step"], curve[column], linewidth=0.8, **style)
+    for panel, title in zip(panels, ("loss (px)", "inliers (share)"), strict=True):
+        panel.set_title(title, fontsize=9)
+        panel.set_xlabel("step")
+        tidy(panel)
+    panels[0].set_yscale("log")
+    if curves:
+        _save(figure, panels[0], folder / CURVES)
+    return bool(curves)
 
 
 def _panels(titles: Sequence[str], threshold: Threshold) -> tuple[Figure, list[Axes]]:

@@ -4,13 +4,20 @@ OUT/tables.md     all tables: means, contrasts, definitions of the columns
 OUT/tables.tex    the tables of the paper, its rows below ours
 OUT/bars.svg      final accuracy of each scene
 OUT/figure.svg    accuracy over stages: each scene while later ones are learned
+OUT/training.svg  loss and inliers of every training
 OUT/overlays.png  test images: their contours by the pose of each strategy
 """
 
 from pathlib import Path
 
 from evercal.continual.benchmark import comparison, results as stored
-from evercal.continual.benchmark.figures import BARS, LINES, draw_figures
+from evercal.continual.benchmark.figures import (
+    BARS,
+    CURVES,
+    LINES,
+    draw_curves,
+    draw_figures,
+)
 from evercal.continual.benchmark.overlays import OVERLAYS, draw_overlays
 from evercal.continual.benchmark.paper_tables import (
     ACCURACY,
@@ -68,6 +75,8 @@ def write_report(folder: Path, reference: str) -> tuple[str, list[JsonObject]]:
     figures = f"![final accuracy]({BARS})\n![accuracy over stages]({LINES})"
     if draw_overlays(folder, methods.index):
         figures += f"\n![contours by the estimated poses]({OVERLAYS})"
+    if draw_curves(folder):
+        figures += f"\n![loss and inliers of every training]({CURVES})"
     page = f"{text}\n\n{comparison.LEGEND}\n\n{figures}\n"
     write_bytes(folder / TABLES, page.encode())
     text_of_paper = latex(paper)
