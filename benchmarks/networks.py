@@ -33,7 +33,7 @@ FILLED = (*COMPARED, "sars_spdd_filled")
 """Strategies whose memory is varied."""
 BOUNDED = (*FILLED, "joint", "finetune")
 """The same beside joint training and fine-tuning, the best and the worst case."""
-CONTROLS = ("evercal", "evercal_network", "joint", "isolation", "finetune")
+CONTROLS = ("evercal", "sars_pixels", "joint", "isolation", "finetune")
 """Strategies without a method of continual learning."""
 AT_480 = (
     "sars_spdd_filled",

@@ -383,6 +383,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "network-checks: the paper's head": network_tables.summary("networks-b"),
     "network-checks: memory": network_tables.memory,
     "network-checks: real rooms": network_tables.summary("networks-real"),
+    "network-trials: ideas": network_tables.summary("networks-ideas", single=True),
     "network-trials: units of positions": _rows(
         "room,frames,side,metre,axes,reach,deviation", "sars-units"
     ),

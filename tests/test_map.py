@@ -283,12 +283,12 @@ def test_stores_of_networks_and_other_folders_are_refused(
     payload = {
         **manifest.payload,
         "kind": "networks",
-        "strategy": "evercal_network",
+        "strategy": "sars_pixels",
         **empty,
     }
     write_manifest(root, payload, [])
     with pytest.raises(
-        InputError, match=rf"{root}: holds networks of strategy 'evercal_network'"
+        InputError, match=rf"{root}: holds networks of strategy 'sars_pixels'"
     ):
         Map.open(root)
     (tmp_path / "photos").mkdir()

@@ -84,7 +84,7 @@ def three_stages(
     from .stages import learn
 
     stages: dict[str, list[LearnedScenes]] = {}
-    for name in ("evercal_network", "isolation"):
+    for name in ("sars_pixels", "isolation"):
         stages[name] = [first_stages[name].copy_for_training()]
         for room in rooms[1:]:
             stages[name].append(learn(stages[name][-1], STRATEGIES[name], room, quick))
@@ -125,7 +125,7 @@ def arc_scenes(
     from .stages import learn
 
     def train() -> tuple[LearnedScenes, LearnedScenes]:
-        strategy = STRATEGIES["evercal_network"]
+        strategy = STRATEGIES["sars_pixels"]
         options = replace(arc_stage, fit=replace(arc_stage.fit, iterations=450))
         encoder = load_encoder(DESCRIBED_ENCODER)
         empty = LearnedScenes(encoder, load_descriptor(), strategy.name, 120)

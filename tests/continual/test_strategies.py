@@ -141,7 +141,6 @@ def test_invalid_plugins_are_refused(tmp_path: Path, text: str, message: str) ->
         ("er", lambda method: method.weight),
         ("mir", lambda method: method.weight),
         ("lwf", lambda method: method.weight),
-        ("evercal_network", lambda method: method.weight),
         ("sars_spdd", lambda method: method.weight),
         ("gec", lambda method: method.alpha),
         ("ewc", lambda method: method.strength),

@@ -22,7 +22,6 @@ from evercal.continual.methods.penalties import (
     OldPixels,
     Relations,
 )
-from evercal.continual.methods.preconditioning import PreconditionedReplay
 from evercal.continual.methods.replay import Replay
 from evercal.errors import InputError
 from evercal.typing import JsonObject, Strings
@@ -72,7 +71,6 @@ class Strategy:
 # docs/methods.md; methods with the loss of another have its weight.
 _METHODS: dict[str, Method | None] = {
     "evercal": None,
-    "evercal_network": PreconditionedReplay(),
     "finetune": FineTuning(),
     "er": Replay(weight=3.0),
     "icarl": Replay("herding", OldOutput()),

@@ -35,8 +35,8 @@ from ..stages import (
     weights,
 )
 
-NETWORK = STRATEGIES["evercal_network"]
-SCENE_BY_SCENE = ["evercal_network", "gec", "mir", "lwf", "isolation"]
+NETWORK = STRATEGIES["sars_pixels"]
+SCENE_BY_SCENE = ["sars_pixels", "gec", "mir", "lwf", "isolation"]
 
 
 def shortest(options: StageOptions) -> StageOptions:
@@ -54,7 +54,7 @@ def test_events_are_in_order(
     first_stages: Stages, rooms: Rooms, quick: StageOptions
 ) -> None:
     events: list[Encoding | Progress] = []
-    second_stage(first_stages["evercal_network"], rooms, quick, events.append)
+    second_stage(first_stages["sars_pixels"], rooms, quick, events.append)
     kinds = [kind for kind, _ in groupby(type(event) for event in events)]
     assert kinds == [Encoding, Progress]
     encodings = [event for event in events if isinstance(event, Encoding)]
@@ -121,7 +121,7 @@ def test_memory_in_bytes_is_respected_and_used(
     assert sizes[0] < sizes[1] < sizes[2] == 30
 
 
-@pytest.mark.parametrize("name", ["evercal_network", "isolation"])
+@pytest.mark.parametrize("name", ["sars_pixels", "isolation"])
 def test_whitening_is_fitted_to_the_first_scene_only(
     name: str, first_stages: Stages, rooms: Rooms, quick: StageOptions
 ) -> None:
@@ -135,7 +135,7 @@ def test_whitening_is_fitted_to_the_first_scene_only(
 def test_centres_lie_in_the_cell_of_their_scene(
     first_stages: Stages, rooms: Rooms, quick: StageOptions
 ) -> None:
-    after = second_stage(first_stages["evercal_network"], rooms, quick)
+    after = second_stage(first_stages["sars_pixels"], rooms, quick)
     head = after.heads[0]
     for i, scene in enumerate(rooms[:2]):
         centres = head.centres[head.centre_scene == i].double().numpy()
@@ -166,7 +166,7 @@ class RecordingPenalty(Penalty):
 def test_replayed_rows_are_of_old_scenes_and_the_teacher_is_the_old_head(
     first_stages: Stages, rooms: Rooms, quick: StageOptions
 ) -> None:
-    scenes = first_stages["evercal_network"]
+    scenes = first_stages["sars_pixels"]
     keyframes = scenes.keyframes[0]
     assert keyframes is not None
     penalty = RecordingPenalty()
@@ -199,7 +199,7 @@ def test_replayed_rows_are_of_old_scenes_and_the_teacher_is_the_old_head(
 def test_training_depends_on_the_seed_only(
     first_stages: Stages, rooms: Rooms, quick: StageOptions
 ) -> None:
-    scenes = first_stages["evercal_network"]
+    scenes = first_stages["sars_pixels"]
     torch.manual_seed(12345)
     again = second_stage(scenes, rooms, quick)
     same = second_stage(scenes, rooms, quick)

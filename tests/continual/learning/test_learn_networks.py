@@ -95,7 +95,7 @@ def test_bad_input_is_refused_and_leaves_the_store_unchanged(
     few = replace(gamma, train=gamma.train[:15])
     for recording, change, message in (
         (replace(gamma, name="alpha"), {}, "'alpha'.*`name`"),
-        (gamma, {"strategy": "finetune"}, r"'finetune'.*'evercal_network'"),
+        (gamma, {"strategy": "finetune"}, r"'finetune'.*'sars_pixels'"),
         (gamma, {"strategy": "nonsense"}, "'nonsense'"),
         (gamma, {"strategy": "joint"}, r"'joint'.*evercal bench"),
         (gamma, {"strategy": "evercal"}, r"'evercal'.*scene by scene"),

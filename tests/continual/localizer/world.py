@@ -190,6 +190,6 @@ def make_world(
         records.append(replace(record, inlier_threshold=threshold))
     descriptor = cast(GlobalDescriptor, LevelDescriptor())
     scenes = LearnedScenes(
-        BlockMean(), descriptor, "evercal_network", SHORT_SIDE, [head], records
+        BlockMean(), descriptor, "sars_pixels", SHORT_SIDE, [head], records
     )
     return World(scenes, head)

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from evercal.continual.methods.penalties import (
-    AnchoredReprojection,
     BoundedByTeacher,
     Distillation,
     OldOutput,
+    OldPixels,
     Penalty,
     Relations,
     Reprojection,
@@ -104,37 +104,28 @@ def test_relations_cover_every_remembered_scene(scene: int) -> None:
     assert 120 <= int(used) <= 136
 
 
-def test_anchored_reprojection_by_hand() -> None:
-    # Row 0: the teacher is exact, the student has an error of 3 px (6 cm): both terms apply.
-    # Row 1: the teacher is wrong and ignored, the student is exact.
-    penalty = AnchoredReprojection(clamp_px=5.0, teacher_limit_px=10.0)
-    teacher = head_output([off_by(0.0), off_by(40.0)])
+def test_old_points_in_pixels_by_hand() -> None:
+    """Half reprojection, half the distance to the teacher in pixels at its depth."""
+    teacher = head_output([off_by(0.0), off_by(4.0)])
     student = head_output([off_by(3.0), off_by(0.0)])
-    expected = 5 * math.tanh(3.0 / 5) / 2 + PX_PER_M * 0.06 / 2
-    for tau_px in (100.0, 1.0):  # the clamp is fixed
-        assert cost(penalty, student, teacher, rows(2), tau_px) == pytest.approx(
-            expected
+    for tau_px in (100.0, 7.0, 1.0):
+        scale = max(tau_px, 5.0)
+        distance = scale * (math.log1p(3.0 / scale) + math.log1p(4.0 / scale)) / 2
+        reprojection = tau_px * math.tanh(3.0 / tau_px) / 2
+        assert cost(OldPixels(), student, teacher, rows(2), tau_px) == pytest.approx(
+            0.5 * distance + 0.5 * reprojection, rel=1e-4
         )
 
 
-def test_accurate_teacher_constrains_the_depth() -> None:
+def test_teacher_constrains_the_depth_in_pixels() -> None:
+    """A decimetre along the ray is as many pixels as a decimetre across it."""
+    teacher = head_output([off_by(0.0)])
     student = head_output([[0.0, 0.0, DEPTH_M + 0.1]])
-    right = head_output([off_by(0.0)])
-    penalty = AnchoredReprojection()
-    assert cost(penalty, student, right, rows(1), 0.0) == pytest.approx(
-        PX_PER_M * 0.1, rel=1e-5
-    )
-    wrong = head_output([off_by(20.0)])
-    assert cost(penalty, student, wrong, rows(1), 0.0) == pytest.approx(0.0, abs=1e-6)
-
-
-def test_teacher_behind_the_camera_is_ignored() -> None:
-    # Division by its depth gives the target pixel.
-    behind = head_output([[0.0, 0.0, -DEPTH_M]])
-    actual = cost(
-        AnchoredReprojection(), head_output([off_by(0.0)]), behind, rows(1), 0.0
-    )
-    assert actual == pytest.approx(0.0, abs=1e-6)
+    focal = float(rows(1).target.focals[0, 0])
+    pixels = 0.1 * focal / DEPTH_M
+    expected = 0.5 * 5.0 * math.log1p(pixels / 5.0)
+    actual = cost(OldPixels(), student, teacher, rows(1), 1.0)
+    assert actual == pytest.approx(expected, rel=1e-4)
 
 
 def output(centres: int, generator: torch.Generator) -> HeadOutput:

@@ -22,7 +22,7 @@ from ..stages import MakeStore, Tree
 Stages = dict[str, list[LearnedScenes]]
 
 GREY = np.random.default_rng(0).integers(0, 256, (48, 64)).astype(np.uint8)
-STRATEGIES = pytest.mark.parametrize("strategy", ["evercal_network", "isolation"])
+STRATEGIES = pytest.mark.parametrize("strategy", ["sars_pixels", "isolation"])
 
 
 def stored(head: Head) -> dict[str, Tensor]:
@@ -81,7 +81,7 @@ def test_store_opens_as_it_was_written(
 
 
 @pytest.mark.parametrize(
-    ("strategy", "heads"), [("evercal_network", [3]), ("isolation", [1, 2, 3])]
+    ("strategy", "heads"), [("sars_pixels", [3]), ("isolation", [1, 2, 3])]
 )
 def test_of_a_shared_head_only_the_newest_file_remains(
     strategy: str,
@@ -110,7 +110,7 @@ def test_other_folders_are_refused(tmp_path: Path, tree: Tree) -> None:
         with pytest.raises(InputError, match=str(tmp_path / name)):
             NetworkStore.open(tmp_path / name)
         with pytest.raises(InputError, match="not an evercal store"):
-            NetworkStore.create(tmp_path / name, "evercal_network")
-    NetworkStore.create(tmp_path / "new", "evercal_network")
+            NetworkStore.create(tmp_path / name, "sars_pixels")
+    NetworkStore.create(tmp_path / "new", "sars_pixels")
     assert tree(tmp_path) == before
     assert not (tmp_path / "new").exists()

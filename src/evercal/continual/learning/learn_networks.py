@@ -64,7 +64,7 @@ class NetworkReport(LearnReport):
 class NetworkLearnOptions:
     """How a scene is learned into a store of networks."""
 
-    strategy: str | Strategy = "evercal_network"
+    strategy: str | Strategy = "sars_pixels"
     """The strategy or its name; a store keeps the one it was made with."""
     stage: StageOptions = field(default_factory=partial(preset, "fast"))
     """Options of the stage."""

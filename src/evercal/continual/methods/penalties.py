@@ -140,33 +140,6 @@ class Relations(Penalty):
 
 
 @frozen
-class AnchoredReprojection(Penalty):
-    """Reprojection loss, and distance to the teacher's points where these were accurate.
-
-    Reprojection to the known poses with a tight, fixed clamp does not accumulate errors over
-    stages. The distance to the teacher constrains the depth, which a single projection does not
-    (after the teacher-bounded regression of Buff-CS, Wang et al., ICCV 2021).
-    """
-
-    clamp_px: float = 5.0
-    """Soft clamp of the reprojection error, pixels."""
-    px_per_m: float = PX_PER_M
-    """Weight of the distance to the teacher's points, pixels per metre."""
-    teacher_limit_px: float = 10.0
-    """Reprojection error below which the teacher's point is used."""
-
-    def __call__(
-        self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
-    ) -> Tensor:
-        """Compute the loss in pixels."""
-        cost, _ = fixed_clamp_loss(student.points, rows.target, self.clamp_px)
-        _, error = fixed_clamp_loss(teacher.points, rows.target, self.clamp_px)
-        distance = _distance_m(student, teacher)
-        anchored = torch.where(error < self.teacher_limit_px, distance, 0.0)
-        return cost.mean() + self.px_per_m * anchored.mean()
-
-
-@frozen
 class OldPixels(Penalty):
     """Reprojection loss, and distance to the teacher's points in pixels at their depth.
 

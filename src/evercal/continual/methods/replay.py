@@ -70,8 +70,6 @@ class Replay(EpisodicMemory):
     """Loss of the replayed rows."""
     weight: float = 1.0
     """Weight of the penalty, the mean over the rows of all remembered scenes."""
-    every_scene: bool = False
-    """Multiply the weight by the number of remembered scenes; the paper has one for all of them."""
 
     def hooks(self, start: StageStart) -> TrainingHooks:
         """Replay from the stage's memories."""
@@ -92,10 +90,7 @@ class ReplayHooks(MemoryHooks):
         old_output = output
         if method.penalty.needs_teacher and self._teacher:
             old_output = teacher_output(self._teacher, rows)
-        weight = method.weight
-        if method.every_scene:
-            weight = len(self.memories) * weight
-        return weight * method.penalty(output, old_output, rows, tau_px)
+        return method.weight * method.penalty(output, old_output, rows, tau_px)
 
 
 def teacher_output(teacher: Head, rows: Rows) -> HeadOutput:
