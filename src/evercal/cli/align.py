@@ -1,17 +1,17 @@
 """`evercal align`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from evercal.classes import frozen
 from evercal.cli import args
+from evercal.cli.console import motion
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
 
     from evercal.calibration.from_map.align import MapAlignment
-    from evercal.map import Map
 
 
 @frozen
@@ -63,14 +63,18 @@ class Align(args.Verb):
 
         cell = Map(MapStore.open(self.store))
         unit = cell.localizer.contents.scene(self.scene).unit or 1.0
-        if by_points:
-            alignment = self._by_points(cell)
-        else:
-            alignment = self._by_gripper(cell)
+        given = self._by_points() if by_points else self._by_gripper()
+        alignment = cell.align(
+            self.scene,
+            **given,
+            unknown_scale=self.unknown_scale,
+            base_frame=self.base_frame,
+        )
         self._show(alignment, unit)
         return 0
 
-    def _by_gripper(self, cell: "Map") -> "MapAlignment":
+    def _by_gripper(self) -> dict[str, Any]:
+        """What `Map.align` takes of images with gripper poses."""
         from evercal.calibration.boards.board_poses import read_board_poses
         from evercal.recordings.image_files import image_files
 
@@ -84,17 +88,15 @@ class Align(args.Verb):
                 pose = poses.get(file.name)
                 if pose:
                     boards[str(file)] = pose
-        return cell.align(
-            self.scene,
-            files,
-            robot_poses=self.robot_poses,
-            convention=self.convention,
-            boards=boards,
-            unknown_scale=self.unknown_scale,
-            base_frame=self.base_frame,
-        )
+        return {
+            "images": files,
+            "robot_poses": self.robot_poses,
+            "convention": self.convention,
+            "boards": boards,
+        }
 
-    def _by_points(self, cell: "Map") -> "MapAlignment":
+    def _by_points(self) -> dict[str, Any]:
+        """What it takes of points."""
         from evercal.calibration.picked_points import read_picks, read_points
         from evercal.recordings import read_image
 
@@ -110,13 +112,7 @@ class Align(args.Verb):
             by_image.setdefault(image, {})[name] = pixel
         folder = self.picks.parent
         picks = [(name, read_image(folder / name), p) for name, p in by_image.items()]
-        return cell.align(
-            self.scene,
-            points=points,
-            picks=picks,
-            unknown_scale=self.unknown_scale,
-            base_frame=self.base_frame,
-        )
+        return {"points": points, "picks": picks}
 
     def _show(self, alignment: "MapAlignment", unit: float) -> None:
         """Print it; `unit` is that of the recording, per unit of the map."""
@@ -142,7 +138,7 @@ class Align(args.Verb):
                 "warnings": alignment.warnings,
                 "left_out": alignment.left_out,
             },
-            f"aligned {self.scene}: standard deviation {mm:.2f} mm and {deg:.3f} deg per axis in"
+            f"aligned {self.scene}: standard deviation {motion(mm, deg, ' and ')} per axis in"
             f" the middle of the scene; scale {scale:.5f}; {alignment.used} of"
             f" {alignment.given} are inliers, residual {alignment.residual}",
             *lines,

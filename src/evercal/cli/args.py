@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from evercal.recordings import Recording
     from evercal.reports.inspected import LearnedLocalizer
     from evercal.robot.pose_errors import ArmErrors
-    from evercal.typing import Strings
+    from evercal.typing import Size, Strings
 
 MAP = "evercal"
 """The strategy of a map."""
@@ -276,7 +276,7 @@ def camera_for(file: Path | None, images: Sequence[Path]) -> "Camera | None":
     return stated_camera(file, first_size(images))
 
 
-def stated_camera(file: Path | None, size: tuple[int, int]) -> "Camera | None":
+def stated_camera(file: Path | None, size: "Size | None" = None) -> "Camera | None":
     """The camera in the file of --camera, for images of (width, height)."""
     from evercal.recordings.cameras.camera_file import read_camera
 

@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 from evercal.classes import frozen
 from evercal.cli import args
 from evercal.cli.calibrate import held_out_lines, joint_lines, lens_lines
-from evercal.cli.console import require_writable, say, say_notes, size
+from evercal.cli.console import motion, require_writable, say, say_notes, size
 from evercal.cli.info import adjusted_row
 from evercal.cli.training import Training, observer
 from evercal.errors import InputError
@@ -317,7 +317,7 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
         quaternion = ", ".join(map("{:.5f}".format, pose.pose.rotation_wxyz))
         yield (
             f"gripper_from_camera: ({position}) mm, quaternion wxyz ({quaternion});"
-            f" standard deviation {pose.sigma_mm:.2f} mm and {pose.sigma_deg:.3f} deg per axis;"
+            f" standard deviation {motion(pose.sigma_mm, pose.sigma_deg, ' and ')} per axis;"
             f" {found.pairs} of {found.of_pairs} image pairs are inliers"
         )
         yield from lens_lines(found.calibration)

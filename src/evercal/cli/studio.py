@@ -176,8 +176,4 @@ class Studio(PageVerb):
 
 
 def _intrinsics(file: Path | None, camera: "StreamCamera | None") -> "Camera | None":
-    from evercal.recordings.cameras.camera_file import read_camera
-
-    if not file:
-        return camera and camera.intrinsics()
-    return read_camera(file)
+    return args.stated_camera(file) or (camera and camera.intrinsics())

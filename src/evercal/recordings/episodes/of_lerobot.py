@@ -17,11 +17,12 @@ from evercal.recordings.episodes.episode import (
     values_of_joints,
 )
 from evercal.recordings.formats import lerobot
-from evercal.recordings.formats.lerobot_poses import STATE, Info, names_of
+from evercal.recordings.formats.lerobot_poses import STATE, names_of
 from evercal.recordings.poses.row_files import number_array
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import library_errors, named_errors
+from evercal.typing import Record
 
 _ON_THE_ARM = re.compile("wrist|hand|gripper")
 """Words in the names of cameras that move."""
@@ -67,7 +68,7 @@ def episodes(
     return total * len(places), each()
 
 
-def stated_features(root: Path, info: Info, wanted: str | None) -> dict[str, str]:
+def stated_features(root: Path, info: Record, wanted: str | None) -> dict[str, str]:
     """The feature that states the pose of each fixed camera; empty if there is none."""
     found = {}
     for key in lerobot.picture_keys(info):

@@ -17,7 +17,7 @@ from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, pose_to_dict
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import StoredImage, write_image
-from evercal.robot.frame_names import UNKNOWN, FrameNames
+from evercal.robot.frame_names import FrameNames
 from evercal.storage import write_json
 from evercal.storage.records import of_format
 from evercal.storage.text_files import (
@@ -28,7 +28,7 @@ from evercal.storage.text_files import (
     read_json,
     refuse_repeated,
 )
-from evercal.typing import JsonObject, PathLike, Record, Strings
+from evercal.typing import JsonObject, PathLike, Record
 
 FILE = "scene.json"
 """File that lists the frames."""
@@ -102,10 +102,7 @@ def write(
         on_frame: Called after every frame, for progress bars.
     """
     with SceneWriter(root, recording.name, link) as writer:
-        writer.untracked = recording.untracked
-        writer.notes = recording.notes
-        writer.metric = recording.metric
-        writer.names = recording.frames
+        writer.about = recording
         for split in ("train", "test"):
             for frame in getattr(recording, split):
                 writer.add(frame, split)
@@ -120,13 +117,9 @@ class SceneWriter:
     """
 
     def __init__(self, root: PathLike, name: str, link: bool = False) -> None:
-        self.untracked = 0
-        self.notes: Strings = ()
-        self.metric = True
-        self.names = UNKNOWN
+        self.about = Recording(name, (), ())
         self.render: JsonObject | None = None
         self._root = Path(root)
-        self._name = name
         self._link = link
         self._cameras: dict[Camera, str] = {}
         self._entries: dict[str, JsonObject] = {}
@@ -142,21 +135,22 @@ class SceneWriter:
         """Write scene.json unless an error was raised."""
         if kind is not None:
             return
+        about = self.about
         data: JsonObject = {
             "format": _FORMAT,
             "version": _VERSION,
-            "name": self._name,
+            "name": about.name,
             "cameras": {
                 number: camera.to_dict() for camera, number in self._cameras.items()
             },
             "frames": list(self._entries.values()),
-            "untracked": self.untracked,
-            "frame_names": vars(self.names),
+            "untracked": about.untracked,
+            "frame_names": vars(about.frames),
         }
-        if not self.metric:
+        if not about.metric:
             data["unit"] = "unknown"
-        if self.notes:
-            data["notes"] = list(self.notes)
+        if about.notes:
+            data["notes"] = list(about.notes)
         if self.render is not None:
             data["render"] = self.render
         with self._new(FILE) as file:
@@ -258,8 +252,7 @@ def _frame(
         optional["depth"] = root / path_inside(depth, "'depth'")
     joints = entry.get("joints_rad")
     if joints is not None:
-        count = len(joints) if isinstance(joints, list) else 7
-        optional["joints_rad"] = tuple(_numbers(joints, count, "joints_rad"))
+        optional["joints_rad"] = tuple(_numbers(joints, "joints_rad"))
     if not isinstance(camera, str) or camera not in cameras:
         raise ValueError(f"'camera' is one of {sorted(cameras)}, got {camera!r}")
     if split not in ("train", "test"):
@@ -276,15 +269,17 @@ def _pose(data: Any) -> SE3 | None:
         return None
     if not isinstance(data, dict):
         data = {}
-    translation = np.array(_numbers(data.get("translation_m"), 3, "translation_m"))
-    quaternion = np.array(_numbers(data.get("quaternion_wxyz"), 4, "quaternion_wxyz"))
+    parts = []
+    for key, count in (("quaternion_wxyz", 4), ("translation_m", 3)):
+        parts.append(np.array(_numbers(data.get(key), key, count)))
+    quaternion, translation = parts
     if not abs(np.linalg.norm(quaternion) - 1.0) < 1e-2:
         raise ValueError(f"'quaternion_wxyz' has length 1, got {quaternion}")
     return SE3(quaternion, translation)
 
 
-def _numbers(value: Any, count: int, name: str) -> list[float]:
-    is_list = isinstance(value, list) and len(value) == count
+def _numbers(value: Any, name: str, count: int | None = None) -> list[float]:
+    is_list = isinstance(value, list) and count in (None, len(value))
     if not is_list or not all(map(is_real, value)):
-        raise ValueError(f"'{name}' is {count} numbers, got {value!r}")
+        raise ValueError(f"'{name}' is {count or 'a list of'} numbers, got {value!r}")
     return [*map(float, value)]

@@ -22,7 +22,7 @@ import numpy as np
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError, optional_module
 from evercal.recordings.cameras.camera_file import read_camera_of_size
-from evercal.recordings.formats.lerobot_poses import Info, feature_poses, pose_feature
+from evercal.recordings.formats.lerobot_poses import feature_poses, pose_feature
 from evercal.recordings.formats.video_file import VideoFrame, Videos
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import (
@@ -40,7 +40,7 @@ from evercal.storage.text_files import (
     path_inside,
     read_json,
 )
-from evercal.typing import Array, Image
+from evercal.typing import Array, Image, Record, Size
 
 INFO = Path("meta") / "info.json"
 
@@ -94,9 +94,9 @@ def _load(root: Path, options: ReadOptions) -> Recording:
     )
 
 
-def dataset_info(root: Path) -> Info:
+def dataset_info(root: Path) -> Record:
     """The content of info.json; versions and paths that are not read are refused."""
-    info: Info = read_json(root / INFO, "LeRobot dataset")
+    info: Record = read_json(root / INFO, "LeRobot dataset")
     version = str(info["codebase_version"])
     features = info["features"]
     if not version.startswith(("v2.", "v3.")):
@@ -112,7 +112,7 @@ def dataset_info(root: Path) -> Info:
     return info
 
 
-def image_size_of(info: Info, key: str) -> tuple[int, int]:
+def image_size_of(info: Record, key: str) -> Size:
     """Width and height of the images of a feature."""
     shape = [int(n) for n in info["features"][key]["shape"]]
     if shape[0] == 3:  # some state channels first
@@ -121,7 +121,7 @@ def image_size_of(info: Info, key: str) -> tuple[int, int]:
     return width, height
 
 
-def camera_key(root: Path, info: Info, wanted: str | None) -> str:
+def camera_key(root: Path, info: Record, wanted: str | None) -> str:
     """The feature of the images that are wanted, or the only one."""
     keys = picture_keys(info)
     if wanted is None and len(keys) == 1:
@@ -134,7 +134,7 @@ def camera_key(root: Path, info: Info, wanted: str | None) -> str:
     )
 
 
-def picture_keys(info: Info) -> list[str]:
+def picture_keys(info: Record) -> list[str]:
     """Features of colour images."""
     keys = []
     for key, feature in info["features"].items():
@@ -195,7 +195,7 @@ def rows_in(file: Path, column: str) -> tuple[list[Row], Array]:
 
 
 def images_of(
-    root: Path, info: Info, key: str, rows: Sequence[Row]
+    root: Path, info: Record, key: str, rows: Sequence[Row]
 ) -> list[StoredImage]:
     """The images of a camera at some rows."""
     if info["features"][key]["dtype"] == "image":
@@ -206,8 +206,10 @@ def images_of(
     if str(info["codebase_version"]).startswith("v2"):
         size = int(info.get("chunks_size", 1000))
         for i in {row.episode for row in rows}:
-            numbers = {"episode_chunk": i // size, "episode_index": i}
-            starts[i] = (_video(root, template, video_key=key, **numbers), 0.0)
+            path = _video(
+                root, template, video_key=key, episode_chunk=i // size, episode_index=i
+            )
+            starts[i] = (path, 0.0)
     else:
         starts = _video_starts(root, template, key)
     frames: list[StoredImage] = []
@@ -229,8 +231,9 @@ def _video_starts(root: Path, template: str, key: str) -> dict[int, tuple[Path, 
     names = ["episode_index", *(f"videos/{key}/{part}" for part in parts)]
     for file in files_in(root / "meta" / "episodes", (".parquet",), "*/*"):
         for episode, chunk, number, start in zip(*columns(file, names), strict=True):
-            numbers = {"chunk_index": chunk, "file_index": number}
-            path = _video(root, template, video_key=key, **numbers)
+            path = _video(
+                root, template, video_key=key, chunk_index=chunk, file_index=number
+            )
             starts[int(episode)] = (path, float(start))
     return starts
 

@@ -7,7 +7,6 @@ such as left_ee, if one feature holds left_ee.x and right_ee.x.
 """
 
 from pathlib import Path
-from typing import TypeAlias
 
 from evercal.errors import InputError
 from evercal.recordings.poses.conventions import (
@@ -22,8 +21,6 @@ from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import named_errors, refuse_repeated
 from evercal.typing import Array, Record
 
-Info: TypeAlias = Record
-"""Content of info.json, or of a feature in it."""
 STATE = "observation.state"
 """Feature of the joints."""
 _PARTS = {
@@ -33,7 +30,7 @@ _PARTS = {
 """Names of the numbers of a pose, by convention."""
 
 
-def pose_feature(root: Path, info: Info, options: ReadOptions) -> str:
+def pose_feature(root: Path, info: Record, options: ReadOptions) -> str:
     """Name of the feature with the poses, or with the joints where there is a URDF."""
     features = info["features"]
     if options.urdf:
@@ -77,7 +74,7 @@ def pose_feature(root: Path, info: Info, options: ReadOptions) -> str:
 
 def feature_poses(
     root: Path,
-    info: Info,
+    info: Record,
     column: str,
     values: Array,
     options: ReadOptions,
@@ -163,7 +160,7 @@ def _of_arm(names: list[str], arm: str) -> list[str]:
     return [name if name.rpartition(".")[0] == arm else "" for name in names]
 
 
-def names_of(info: Info, column: str) -> list[str]:
+def names_of(info: Record, column: str) -> list[str]:
     """Names of the numbers of a feature."""
     names = info["features"].get(column, {}).get("names") or []
     if isinstance(

@@ -17,6 +17,7 @@ import numpy as np
 
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
+from evercal.geometry.camera import COEFFICIENTS
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import (
     IMAGE_ENDINGS,
@@ -206,16 +207,14 @@ def _camera(data: Record) -> Camera:
     numbers = [_number(data, key, 0.0) for key in _LENS]
     stated = data.get("distortion_params", numbers)
     coefficients = number_array(stated, "'distortion_params'").tolist()
-    unused = (4, 5) if fisheye else (3,)
+    kind = "fisheye" if fisheye else "pinhole"
+    names = COEFFICIENTS[kind][:5]
+    unused = [name for name in _LENS if name not in names]
+    values: dict[str, float] = dict(zip(_LENS, coefficients, strict=False))
     differs = any(numbers) and coefficients != numbers
-    if (
-        differs
-        or len(coefficients) != len(_LENS)
-        or any(coefficients[i] for i in unused)
-    ):
-        zeros = " and ".join(_LENS[i] for i in unused)
+    if differs or len(coefficients) != len(_LENS) or any(map(values.get, unused)):
         raise ValueError(
-            f"distortion is {', '.join(_LENS)}, with {zeros} 0 for {model}, also as"
+            f"distortion is {', '.join(_LENS)}, with {' and '.join(unused)} 0 for {model}, also as"
             f" 'distortion_params', got {coefficients}"
         )
     width = _number(data, "w")
@@ -231,10 +230,8 @@ def _camera(data: Record) -> Camera:
     # Half a pixel: the file counts from the image's corner.
     cx = _number(data, "cx", width / 2) - 0.5
     cy = _number(data, "cy", height / 2) - 0.5
-    k1, k2, k3, k4, p1, p2 = coefficients
     size: Any = (width, height)  # whole numbers, checked when constructed
-    kind = "fisheye" if fisheye else "pinhole"
-    distortion = (k1, k2, k3, k4) if fisheye else (k1, k2, p1, p2, k3)
+    distortion = tuple(values[name] for name in names)
     return Camera(size[0], size[1], fx, fy, cx, cy, distortion, kind)
 
 

@@ -187,9 +187,7 @@ def _of_object(data: Columns, given: Given, robot: bool) -> PoseTable:
         if isinstance(value, Mapping):
             value = [value[key] for key in sorted(value, key=natural_key)]
         lists.append(value)
-        if not isinstance(value, list):
-            raise _unclear([], data)
-    if not has_position([*columns]):
+    if {*map(type, lists)} != {list} or not has_position([*columns]):
         raise _unclear([], data)
     rows = _rows_of(dict(zip(columns, lists, strict=True)))
     return pose_data(rows, given, robot)

@@ -27,8 +27,7 @@ class PoseTrack:
 
     def __post_init__(self) -> None:
         stamps = np.asarray(self.stamps_s, float)
-        shape = stamps.shape
-        if len(shape) != 1 or not stamps.size or shape != self.poses.shape:
+        if not stamps.size or stamps.shape != self.poses.shape:
             raise ValueError(
                 f"a track takes n >= 1 times and poses, got {stamps.shape}"
             )
