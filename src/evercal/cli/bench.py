@@ -83,17 +83,17 @@ class Bench(args.Verb, Training):
             judged = "held-out training frames"
         poses = self.poses if self.poses in ("original", "colour") else "sfm"
         frames = itertools.chain.from_iterable(scene.train for scene in scenes)
-        options = BenchOptions(
-            self._stage,
-            strategies,
-            seeds,
-            self.order,
-            self.short_side or short_side(self.preset, frames),
-            settings={"suite": self.suite, "poses": poses, "judged": judged},
-            device=self.device,
-        )
         with Bars(self.log) as bars:
-            options = dataclasses.replace(options, on_event=observer(bars))
+            options = BenchOptions(
+                self._stage,
+                strategies,
+                seeds,
+                self.order,
+                self.short_side or short_side(self.preset, frames),
+                settings={"suite": self.suite, "poses": poses, "judged": judged},
+                device=self.device,
+                on_event=observer(bars),
+            )
             run = run_tuning if self.tune else run_bench
             for step in run(scenes, options, self.out):
                 bars.write(_progress(step, self.suite))

@@ -79,7 +79,11 @@ class Inspection:
 def inspect_recording(recording: Recording) -> Inspection:
     """Check poses, cameras and some images of a recording."""
     frames = (*recording.train, *recording.test)
-    owner = _pose_owner(frames)
+    owner: Owner = "none"
+    if posed_frames(frames):
+        owner = "camera"
+    elif any(frame.base_from_gripper for frame in frames):
+        owner = "gripper"
     pose_of = attrgetter(
         "base_from_gripper" if owner == "gripper" else "base_from_camera"
     )
@@ -132,14 +136,6 @@ def inspect_recording(recording: Recording) -> Inspection:
         warnings=tuple(warnings),
         **steps,
     )
-
-
-def _pose_owner(frames: Sequence[Frame]) -> Owner:
-    if posed_frames(frames):
-        return "camera"
-    if any(frame.base_from_gripper for frame in frames):
-        return "gripper"
-    return "none"
 
 
 def _require_image_sizes(frames: Sequence[Frame]) -> None:

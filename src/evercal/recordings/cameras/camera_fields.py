@@ -244,15 +244,12 @@ def _matrix(fields: Record, data: Record) -> Array:
             if 0.8 * fy < fx < 1.25 * fy:
                 return _matrix_of(fx, fy, cx, cy)
         if len(numbers) == 16:
-            whole = np.reshape(numbers, (4, 4))
             last = [0, 0, 0, 1]
             if numbers[12:] == last and numbers[3::4] == last:
-                numbers = whole[:3, :3].ravel().tolist()
+                numbers = np.reshape(numbers, (4, 4))[:3, :3].ravel().tolist()
         numbers = numbers_of(numbers, "camera_matrix", 9)
         matrix = np.reshape(numbers, (3, 3))
-        last_row = matrix[2, :2]
-        last_column = matrix[:2, 2]
-        if last_row.any() and not last_column.any():
+        if matrix[2, :2].any() and not matrix[:2, 2].any():
             return matrix.T  # Open3D writes it column after column.
         return matrix
     missing = [name for name in names if name not in fields]
@@ -297,16 +294,13 @@ def _refuse_unknown(data: Record) -> None:
             continue
         if isinstance(value, Mapping):
             value = value.get("data")
-        array = np.array(value, object)
-        cells = np.ravel(array).tolist()
-        if not all(map(is_number, cells)) or not any(map(float, cells)):
-            continue
-        if _is_matrix(key, value, len(cells)):
-            continue
-        raise ValueError(
-            f"{key!r} is not known and may change the image; name distortion k1, k2, p1, p2, k3, or"
-            f" distortion_coefficients in this order, and leave other numbers out"
-        )
+        cells = np.array(value, object).ravel().tolist()
+        are_numbers = all(map(is_number, cells)) and any(map(float, cells))
+        if are_numbers and not _is_matrix(key, value, len(cells)):
+            raise ValueError(
+                f"{key!r} is not known and may change the image; name distortion k1, k2, p1, p2,"
+                f" k3, or distortion_coefficients in this order, and leave other numbers out"
+            )
 
 
 def _is_matrix(key: object, value: object, count: int) -> bool:

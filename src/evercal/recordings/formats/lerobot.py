@@ -68,7 +68,15 @@ def _load(root: Path, options: ReadOptions) -> Recording:
         )
     camera = read_camera_of_size(options.camera, image_size_of(info, key), key)
     column = pose_feature(root, info, options)
-    rows, values = _rows(root, column)
+    rows: list[Row] = []
+    tables = []
+    for file in data_files(root):
+        found, values = rows_in(file, column)
+        rows += found
+        tables.append(values)
+    if not rows:
+        raise InputError(f"{root}: the dataset has no frames")
+    values = np.concatenate(tables)
     stated, notes = feature_poses(root, info, column, values, options)
     frames = []
     for i, image in enumerate(images_of(root, info, key, rows)):
@@ -156,18 +164,6 @@ class Row(NamedTuple):
     file: Path
     row: int
     """Index of the row in `file`."""
-
-
-def _rows(root: Path, column: str) -> tuple[list[Row], Array]:
-    rows: list[Row] = []
-    tables = []
-    for file in data_files(root):
-        found, values = rows_in(file, column)
-        rows += found
-        tables.append(values)
-    if not rows:
-        raise InputError(f"{root}: the dataset has no frames")
-    return rows, np.concatenate(tables)
 
 
 def data_files(root: Path) -> list[Path]:

@@ -229,11 +229,10 @@ def _cameras(root: Path, file: Path | None, images: Sequence[Path]) -> list[Came
     if file.name.startswith("metadata"):  # of Record3D
         with named_errors(file, "camera file"):
             fields = camera_file.fields_of(file)
-            matrices = fields.get("perFrameIntrinsicCoeffs") or []
-            cameras = [
-                camera_file.camera_from_fields({**fields, "K": matrix})
-                for matrix in matrices
-            ]
+            cameras = []
+            for matrix in fields.get("perFrameIntrinsicCoeffs") or []:
+                own = {**fields, "K": matrix}
+                cameras.append(camera_file.camera_from_fields(own))
             if len(cameras) == len(images):
                 return cameras
     return [camera] * len(images)

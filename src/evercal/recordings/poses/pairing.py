@@ -20,7 +20,7 @@ from evercal.storage.text_files import (
     natural_key,
     refuse_repeated,
 )
-from evercal.typing import Array, Strings
+from evercal.typing import Array, BoolArray, Strings
 
 Pairing = tuple[list[SE3 | None], list[str]]
 """The pose of each image, if it has one, and notes."""
@@ -82,11 +82,8 @@ def pair_joints(
         return list(values)
     stamps = rows.stamps_s
     columns = [interpolate(stamps, column, times) for column in values.T]
-    at_images: list[Array | None] = [*np.transpose([value for value, _ in columns])]
-    valid = np.all([is_valid for _, is_valid in columns], 0)
-    for index in np.flatnonzero(~valid):
-        at_images[index] = None
-    return at_images
+    moved, valid = zip(*columns, strict=True)
+    return _where(np.transpose(moved), np.all(valid, 0))
 
 
 def poses_of_images(
@@ -121,6 +118,11 @@ def unpaired(images: Sequence[str], rows: Sequence[str], file: str) -> list[str]
         count = counted(len(rows), "row")
         notes.append(f"{count} of {file} without an image: {few(rows)}")
     return notes
+
+
+def _where(values: Any, valid: BoolArray) -> list[Any]:
+    """Values (n,) that are valid (n,), and None for others."""
+    return [value if v else None for value, v in zip(values, valid, strict=True)]
 
 
 def _of_rows(values: Any, numbers: Sequence[int | None]) -> list[Any]:
@@ -202,10 +204,7 @@ def _by_time(times: Array, track: PoseTrack, file: Path) -> Pairing:
             f"{invalid} taken outside the recorded poses or in a gap of more than {MAX_GAP_S:g} s"
             f" with motion"
         )
-    paired: list[SE3 | None] = list(poses)
-    for index in np.flatnonzero(~valid):
-        paired[index] = None
-    return paired, notes
+    return _where(poses, valid), notes
 
 
 def _image_times(

@@ -165,9 +165,7 @@ def measured_rotation(first: Frame, second: Frame) -> Array | None:
     matrix, inliers = cv2.findEssentialMat(
         a, b, np.eye(3), cv2.RANSAC, 0.999, threshold
     )
-    if matrix is None or matrix.shape != (3, 3):
-        return None
-    if int(inliers.sum()) < MIN_MATCHES:
+    if np.shape(matrix) != (3, 3) or int(inliers.sum()) < MIN_MATCHES:
         return None
     _, matrix, *_ = cv2.recoverPose(matrix, a, b, np.eye(3), mask=inliers)
     second_from_first = Rotation.from_matrix(matrix)

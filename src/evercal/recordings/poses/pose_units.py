@@ -21,8 +21,6 @@ _MAX_DEG = 361.0
 """Largest angle, degrees: a rotation, and some rounding."""
 _UNIT_NAMES = {"m": "metres", "mm": "millimetres", "rad": "radians", "deg": "degrees"}
 """Words for units in messages."""
-_OTHER_UNIT = {"m": "mm", "mm": "m", "rad": "deg", "deg": "rad"}
-"""The other unit of the same kind."""
 
 
 def checked_poses(
@@ -54,10 +52,12 @@ def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
         )
     if not largest > 0 or convention.has("rad", "deg"):
         return
-    likely = "deg" if largest > 2 * np.pi + 1e-6 else "rad"
-    if convention.degrees != (likely == "deg"):
+    units = ("deg", "rad")
+    if convention.degrees:
+        units = ("rad", "deg")
+    if convention.degrees != (largest > 2 * np.pi + 1e-6):
         problem = f"angles up to {largest:.4g} look like"
-        raise _other_unit(likely, problem, convention)
+        raise _other_unit(*units, problem, convention)
 
 
 def _check_lengths(lengths: Array, convention: PoseConvention) -> None:
@@ -78,16 +78,16 @@ def _check_lengths(lengths: Array, convention: PoseConvention) -> None:
         )
     problem = f"positions up to {metres.max(initial=0.0):.4g} m from the base look like"
     if far.any():
-        raise _other_unit("mm", problem, convention)
+        raise _other_unit("mm", "m", problem, convention)
     if near.any() and near.all():
-        raise _other_unit("m", problem, convention)
+        raise _other_unit("m", "mm", problem, convention)
 
 
-def _other_unit(unit: str, problem: str, convention: PoseConvention) -> ConventionError:
+def _other_unit(
+    unit: str, other: str, problem: str, convention: PoseConvention
+) -> ConventionError:
     """An error that offers the convention in a likely unit, and in the other one."""
-    other = _OTHER_UNIT[unit]
     words = convention.name.split(":")
-    words = [word for word in words if word not in (unit, other)]
-    base = ":".join(words)
+    base = ":".join(word for word in words if word not in (unit, other))
     remedy = f"{base}:{unit} (or {base}:{other} if the unit is right as it is)"
     return ConventionError(f"{problem} {_UNIT_NAMES[unit]}", remedy)
