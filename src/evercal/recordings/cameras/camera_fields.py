@@ -176,8 +176,7 @@ def _of_radial_model(kind: str, fields: Record, size: tuple[Any, Any]) -> Camera
     """As Kalibr states it: parameters before the focal lengths, or the one of `fov` after them."""
     numbers = numbers_of(fields.get("camera_matrix"), "intrinsics")
     name = "distortion_coefficients"
-    values = fields.get(name, [])
-    distortion = numbers_of(values, name)
+    distortion = numbers_of(fields.get(name, []), name)
     if kind == "fov":
         numbers = [*distortion, *numbers]
         distortion = []

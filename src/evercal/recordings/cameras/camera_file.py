@@ -113,8 +113,14 @@ def _entries(data: Record, around: Record, name: str) -> Iterator[tuple[str, Rec
     for key, value in fields.items():
         if key not in _OF_ONE_CAMERA:
             inherited[key] = value
-    for inner, entry in _inside(data, name):
-        yield from _entries(entry, inherited, inner)
+    for key, value in data.items():
+        inner = f"{name}.{key}".lstrip(".")
+        parts = {inner: value}
+        if isinstance(value, list):
+            parts = {f"{inner}[{i}]": entry for i, entry in enumerate(value)}
+        for part, entry in parts.items():
+            if isinstance(entry, dict):
+                yield from _entries(entry, inherited, part)
 
 
 def _ungrouped(data: Record) -> JsonObject:
@@ -126,18 +132,6 @@ def _ungrouped(data: Record) -> JsonObject:
             for inner, number in fields.pop(key).items():
                 fields.setdefault(inner, number)
     return fields
-
-
-def _inside(data: Record, name: str) -> Iterator[tuple[str, Record]]:
-    """Entries in an entry, and in its lists, by name."""
-    for key, value in data.items():
-        inner = f"{name}.{key}".lstrip(".")
-        if isinstance(value, dict):
-            yield inner, value
-        elif isinstance(value, list):
-            for i, entry in enumerate(value):
-                if isinstance(entry, dict):
-                    yield f"{inner}[{i}]", entry
 
 
 def fields_of(path: Path, size: Size | None = None) -> Record:

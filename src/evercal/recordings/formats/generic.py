@@ -227,9 +227,7 @@ class SceneWriter:
 
 
 def _cameras(data: object) -> dict[str, Camera]:
-    if not isinstance(data, dict) or not all(
-        isinstance(c, dict) for c in data.values()
-    ):
+    if not isinstance(data, dict) or not {*map(type, data.values())} <= {dict}:
         raise ValueError("'cameras' is an object of objects, got something else")
     cameras = {}
     for number, camera in data.items():

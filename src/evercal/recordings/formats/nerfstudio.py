@@ -295,7 +295,7 @@ def _test_names(root: Path, data: Record, frames: list[str]) -> set[str]:
     test = set()
     for key in ("val_filenames", "test_filenames"):
         names = data.get(key, [])
-        if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+        if not isinstance(names, list) or not {*map(type, names)} <= {str}:
             raise ValueError(f"{key!r} is a list of file names")
         for name in names:
             image = _image(root, name)

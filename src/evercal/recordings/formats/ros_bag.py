@@ -42,39 +42,26 @@ from evercal.recordings.images import (
     is_readable,
 )
 from evercal.recordings.poses.pose_track import MAX_GAP_S
+from evercal.recordings.poses.row_files import by_alias
 from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import named_errors
 from evercal.typing import Image, JsonObject, Size
 
-
-def _encodings(table: str) -> dict[str, tuple[int, int, str]]:
-    encodings = {}
-    for line in table.strip().splitlines():
-        name, size, channels, conversion = line.split()
-        encodings[name] = (int(size), int(channels), conversion)
-    return encodings
-
-
-_ENCODINGS = _encodings("""
-rgb8 1 3 -
-bgr8 1 3 BGR2RGB
-8UC3 1 3 BGR2RGB
-rgba8 1 4 -
-bgra8 1 4 BGRA2RGB
-8UC4 1 4 BGRA2RGB
-rgb16 2 3 -
-bgr16 2 3 BGR2RGB
-mono8 1 1 -
-8UC1 1 1 -
-mono16 2 1 -
-bayer_rggb8 1 1 BayerBG2RGB
-bayer_bggr8 1 1 BayerRG2RGB
-bayer_gbrg8 1 1 BayerGR2RGB
-bayer_grbg8 1 1 BayerGB2RGB
-yuv422 1 2 YUV2RGB_UYVY
-uyvy 1 2 YUV2RGB_UYVY
-yuv422_yuy2 1 2 YUV2RGB_YUY2
-yuyv 1 2 YUV2RGB_YUY2
+_ENCODINGS = by_alias("""
+1 3 -: rgb8
+1 3 BGR2RGB: bgr8 8UC3
+1 4 -: rgba8
+1 4 BGRA2RGB: bgra8 8UC4
+2 3 -: rgb16
+2 3 BGR2RGB: bgr16
+1 1 -: mono8 8UC1
+2 1 -: mono16
+1 1 BayerBG2RGB: bayer_rggb8
+1 1 BayerRG2RGB: bayer_bggr8
+1 1 BayerGR2RGB: bayer_gbrg8
+1 1 BayerGB2RGB: bayer_grbg8
+1 2 YUV2RGB_UYVY: yuv422 uyvy
+1 2 YUV2RGB_YUY2: yuv422_yuy2 yuyv
 """)
 """Bytes of a channel, number of channels, and OpenCV's COLOR_... constant if `as_rgb` needs it. ROS
 names a Bayer pattern by its first two pixels and OpenCV by its second row."""
@@ -268,6 +255,12 @@ def _numbers(message: Any, name: str) -> list[float]:
     return np.asarray(values).reshape(-1).tolist()
 
 
+def _layout(encoding: str) -> tuple[int, int, str]:
+    """A value of `_ENCODINGS`."""
+    size, channels, conversion = _ENCODINGS[encoding].split()
+    return int(size), int(channels), conversion
+
+
 def unsupported(encoding: str) -> str | None:
     """Reason why images of an encoding cannot be read, or None if they can."""
     if encoding in _ENCODINGS:
@@ -282,7 +275,7 @@ def image_of(message: Any) -> Image:
     reason = unsupported(message.encoding)
     if reason is not None:
         raise ValueError(reason)
-    size, channels, _ = _ENCODINGS[message.encoding]
+    size, channels, _ = _layout(message.encoding)
     height = int(message.height)
     width = int(message.width)
     step = int(message.step)
@@ -304,7 +297,7 @@ def image_of(message: Any) -> Image:
 def _rgb(pixels: NDArray[Any], encoding: str) -> Image:
     import cv2
 
-    conversion = _ENCODINGS[encoding][2]
+    _, _, conversion = _layout(encoding)
     if conversion != "-":
         pixels = cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}"))
     return as_rgb(pixels)

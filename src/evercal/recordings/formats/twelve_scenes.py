@@ -43,11 +43,12 @@ def _test_count(root: Path, frames: int) -> int:
     match = re.search(r"\[frames=(\d+)\]", text.split("\n")[0])
     if not match:
         raise InputError(f"{file}: the first line holds no '[frames=N]'")
-    if int(match[1]) > frames:
+    count = int(match[1])
+    if count > frames:
         raise InputError(
-            f"{file}: {match[1]} test frames, but {root / 'data'} has {frames} images"
+            f"{file}: {count} test frames, but {root / 'data'} has {frames} images"
         )
-    return int(match[1])
+    return count
 
 
 def _camera(root: Path, images: list[Path]) -> Camera:
