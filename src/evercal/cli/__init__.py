@@ -217,8 +217,9 @@ def _rejoined(lines: Sequence[str]) -> Iterator[str]:
     head = ""
     texts: list[str] = []
     for line in [*lines, ""]:
+        rest = line[len(_INDENT) : -1].strip()
         if texts and line.startswith(_INDENT):
-            texts.append(line[len(_INDENT) : -1].strip())
+            texts.append(rest)
             continue
         if texts:
             width = len(lines[-1]) - len(_INDENT) - 2
@@ -229,7 +230,7 @@ def _rejoined(lines: Sequence[str]) -> Iterator[str]:
         texts = []
         # A long name stands in a line of its own.
         if head.startswith("│") and head.endswith("  "):
-            texts.append(line[len(_INDENT) : -1].strip())
+            texts.append(rest)
         else:
             yield line
 

@@ -8,7 +8,7 @@ from tyro.conf import Positional
 
 from evercal.classes import frozen
 from evercal.cli import args
-from evercal.cli.calibrate import at_record, calibration_lines, joint_lines
+from evercal.cli.calibrate import joint_lines, show_calibration
 from evercal.cli.console import require_writable, say_notes
 from evercal.progress import Bars
 
@@ -41,7 +41,6 @@ class ArmInView(args.Verb):
         require_writable(self.report, "--report")
         point = args.Point.parse(self.at)
         from evercal.calibration.arm_in_view.solve import calibrate_arm_in_view
-        from evercal.calibration.verdict import tier
         from evercal.recordings.formats.wrist import urdf_beside
         from evercal.robot.robot_model import RobotModel
 
@@ -78,10 +77,5 @@ class ArmInView(args.Verb):
             named = NamedCalibration(self.out.name, calibration)
             page = calibration_page(named, images, point_m=point)
             write_bytes(self.report, page.html.encode())
-        self.answer(
-            {**calibration.to_dict(), **at_record(calibration, point)},
-            *calibration_lines(calibration, point),
-            *joint_lines(calibration.joints, self.out),
-            then=args.next_words(calibration, self.out),
-        )
-        return 0 if tier(calibration) else 1
+        lines = joint_lines(calibration.joints, self.out)
+        return show_calibration(self, calibration, self.out, point, lines)

@@ -1,7 +1,7 @@
 """`evercal calibrate`."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -57,7 +57,6 @@ class Calibrate(args.Verb):
         require_writable(self.out, "--out")
         point = args.Point.parse(self.at)
         folders = self._folders()
-        from evercal.calibration.verdict import tier
         from evercal.recordings.image_files import image_files
 
         if folders:
@@ -67,12 +66,7 @@ class Calibrate(args.Verb):
             args.open_map(self.store, self.scene), images, self.mount
         )
         calibration.write(self.out)
-        self.answer(
-            {**calibration.to_dict(), **at_record(calibration, point)},
-            *calibration_lines(calibration, point),
-            then=args.next_words(calibration, self.out),
-        )
-        return 0 if tier(calibration) else 1
+        return show_calibration(self, calibration, self.out, point)
 
     def _folders(self) -> dict[str, Path]:
         """The folder of each camera of a rig; empty for one camera."""
@@ -141,6 +135,25 @@ def at_record(
     if not point:
         return {}
     return {"at": point.record(calibration.uncertain_pose)}
+
+
+def show_calibration(
+    verb: args.Verb,
+    calibration: "Calibration",
+    out: Path,
+    point: args.Point | None = None,
+    lines: Iterable[str] = (),
+) -> int:
+    """Print a calibration that was written to a file, and further lines; the exit code."""
+    from evercal.calibration.verdict import tier
+
+    verb.answer(
+        {**calibration.to_dict(), **at_record(calibration, point)},
+        *calibration_lines(calibration, point),
+        *lines,
+        then=args.next_words(calibration, out),
+    )
+    return 0 if tier(calibration) else 1
 
 
 def calibration_lines(

@@ -9,7 +9,7 @@ from tyro.conf import Positional
 
 from evercal.classes import frozen
 from evercal.cli import args
-from evercal.cli.calibrate import at_record, calibration_lines, joint_lines
+from evercal.cli.calibrate import joint_lines, show_calibration
 from evercal.cli.console import require_writable
 from evercal.progress import Bars
 
@@ -40,7 +40,6 @@ class EyeToHand(args.Verb):
     def run(self) -> int:
         require_writable(self.out, "--out")
         point = args.Point.parse(self.at)
-        from evercal.calibration.verdict import tier
         from evercal.map import Map
 
         recording = self.reading.recording(self.recording, self.name)
@@ -52,10 +51,5 @@ class EyeToHand(args.Verb):
                     recording, errors=self.which.errors(), on_progress=bars.step
                 )
         calibration.write(self.out)
-        self.answer(
-            {**calibration.to_dict(), **at_record(calibration, point)},
-            *calibration_lines(calibration, point),
-            *joint_lines(calibration.joints, self.out),
-            then=args.next_words(calibration, self.out),
-        )
-        return 0 if tier(calibration) else 1
+        lines = joint_lines(calibration.joints, self.out)
+        return show_calibration(self, calibration, self.out, point, lines)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from evercal.choices import MountName
 from evercal.classes import frozen
 from evercal.cli import args
-from evercal.cli.calibrate import calibration_lines
+from evercal.cli.calibrate import show_calibration
 from evercal.cli.console import motion, require_writable, say_notes
 
 if TYPE_CHECKING:
@@ -54,16 +54,12 @@ class Solve(args.Verb):
 
     def run(self) -> int:
         require_writable(self.out, "--out")
-        from evercal.calibration.verdict import tier
-
         source = {"command": "solve"}
         solved = replace(self._solved(), source=source, frames=self.frames.names())
         calibration = self._with_image_paths(solved)
         calibration.write(self.out)
-        lines = (*calibration_lines(calibration), *_check_lines(calibration))
-        then = args.next_words(calibration, self.out)
-        self.answer(calibration.to_dict(), *lines, then=then)
-        return 0 if tier(calibration) else 1
+        lines = _check_lines(calibration)
+        return show_calibration(self, calibration, self.out, lines=lines)
 
     def _solved(self) -> "Calibration":
         from evercal.calibration.pose_pairs.pair_files import (
