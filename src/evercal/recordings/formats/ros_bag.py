@@ -161,10 +161,9 @@ def _image_topic(bag: BagFile, wanted: str | None) -> str:
     reasons: dict[str, str | None] = {}
     for topic in topics:
         first = bag.first(topic)
-        if bag.kinds[topic] == IMAGE:
-            reasons[topic] = unsupported(first.encoding)
-        else:
-            reasons[topic] = unsupported(_pixels_in(first.format))
+        is_plain = bag.kinds[topic] == IMAGE
+        encoding = first.encoding if is_plain else _pixels_in(first.format)
+        reasons[topic] = unsupported(encoding)
     pictures = [topic for topic, reason in reasons.items() if reason is None]
     if len(pictures) == 1:
         return pictures[0]

@@ -1,7 +1,6 @@
 """Poses of numbers whose units are plausible."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from evercal.geometry import norms
 from evercal.geometry.se3 import SE3
@@ -26,22 +25,18 @@ _UNIT_NAMES = {"m": "metres", "mm": "millimetres", "rad": "radians", "deg": "deg
 def checked_poses(
     numbers: Array, convention: PoseConvention, camera_from: bool = False
 ) -> SE3:
-    """`poses_from_numbers` of (n, k) numbers of plausible size; ValueError for others."""
+    """`poses_from_numbers` of (n, k) numbers of plausible size.
+
+    ValueError: they look like another unit than the convention only implies.
+    """
     poses = poses_from_numbers(numbers, convention, camera_from)
-    check_units(numbers, convention)
-    return poses
-
-
-def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
-    """Refuse numbers (n, k) that look like another unit than the convention only implies."""
-    numbers = np.asarray(numbers, float)
     if not convention.has("m", "mm"):
         positions = numbers[..., :3]
         if convention.is_matrix:
             positions = matrices_from_numbers(numbers, convention.layout)[..., :3, 3]
         _check_lengths(norms(positions), convention)
     if not convention.has_angles:
-        return
+        return poses
     angles = np.abs(numbers[..., 3:])
     if convention.layout == "vector":
         angles = norms(angles)
@@ -51,13 +46,14 @@ def check_units(numbers: ArrayLike, convention: PoseConvention) -> None:
             f"angles up to {largest:.4g} deg; do columns hold {convention.meaning}?"
         )
     if not largest > 0 or convention.has("rad", "deg"):
-        return
+        return poses
     units = ("deg", "rad")
     if convention.degrees:
         units = ("rad", "deg")
     if convention.degrees != (largest > 2 * np.pi + 1e-6):
         problem = f"angles up to {largest:.4g} look like"
         raise _other_unit(*units, problem, convention)
+    return poses
 
 
 def _check_lengths(lengths: Array, convention: PoseConvention) -> None:

@@ -199,10 +199,7 @@ class TfTree:
         topics = self._edges[child]
         if self._topic in topics:
             return topics[self._topic]
-        for edge in topics.values():
-            if edge.moving:
-                return edge
-        return next(iter(topics.values()))
+        return min(topics.values(), key=lambda edge: not edge.moving)
 
     def _refuse_ambiguous(self, child: str) -> None:
         topics = self._edges[child]
