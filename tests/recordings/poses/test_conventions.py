@@ -19,7 +19,7 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
     poses_from_numbers,
 )
-from evercal.recordings.poses.pose_units import check_units
+from evercal.recordings.poses.pose_units import checked_poses
 from evercal.typing import Array
 
 
@@ -199,13 +199,13 @@ def test_other_units_are_refused_unless_stated(
         pytest.raises(ValueError, match=remedy),
         asking_for("--robot-convention"),
     ):
-        check_units(rows(written), pose_convention(read))
+        checked_poses(rows(written), pose_convention(read))
     stated = remedy.split("--robot-convention ")[1]
-    check_units(rows(written), pose_convention(stated))
+    checked_poses(rows(written), pose_convention(stated))
     units = {"mm": ":m", "m": ":mm", "deg": ":rad", "rad": ":deg"}[
         stated.split(":")[-1]
     ]
-    check_units(rows(written), pose_convention(read + units))
+    checked_poses(rows(written), pose_convention(read + units))
 
 
 @pytest.mark.parametrize(("name", "factor"), [("xyzw", 1000.0), ("abb", 0.001)])
@@ -215,7 +215,7 @@ def test_poses_in_mixed_units_are_named(name: str, factor: float) -> None:
     with pytest.raises(
         ValueError, match=r"poses 2, 5 .*millimetres and metres may be mixed"
     ):
-        check_units(numbers, CONVENTIONS[name])
+        checked_poses(numbers, CONVENTIONS[name])
 
 
 @pytest.mark.parametrize(
