@@ -6,10 +6,11 @@ import json
 import math
 from dataclasses import replace
 
+import pandas as pd
 import pytest
 
 from evercal.cli import bench as verb
-from evercal.continual.benchmark.results import STRATEGIES, read, read_frames
+from evercal.continual.benchmark.results import FRAMES, STRATEGIES, read
 from evercal.continual.learning.presets import short_side
 from evercal.errors import InputError
 from evercal.recordings import generic
@@ -79,7 +80,7 @@ def test_held_out_frames_are_training_frames(run, small, arcs, tmp_path):
     assert ran.code == 0, ran.err
     train = {frame.name for scene in arcs for frame in scene.train}
     results = read(tmp_path / "out")
-    frames = read_frames(tmp_path / "out")
+    frames = pd.read_csv(tmp_path / "out" / FRAMES, dtype={"frame": str})
     stages = results[["strategy", "stage", "scene"]].itertuples(index=False, name=None)
     assert list(stages) == [("er_3", 0, "one"), ("er_3", 1, "one"), ("er_3", 1, "two")]
     described = json.loads((tmp_path / "out" / STRATEGIES).read_text())

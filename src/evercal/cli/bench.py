@@ -152,8 +152,6 @@ def _progress(step: "CompletedStage", suite: str) -> str:
 
     run = f"[{step.done}/{step.total}] {step.strategy} seed {step.seed}"
     rows = step.results
-    if rows.empty:
-        return f"{run}: no results before the last stage"
     threshold, _ = thresholds(suite)
     shares = 100 * rows[threshold.column] / rows["frames"]
     scenes = ", ".join(rows["scene"] + shares.map(" {:.1f}".format))

@@ -1,6 +1,6 @@
 """Localization by networks: predicted scene coordinates and PnP."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import field, replace
 from pathlib import Path
 from time import perf_counter
@@ -68,8 +68,6 @@ class NetworkLocalizer:
         self._prototypes: list[torch.Tensor] = []
         for record in scenes.scenes:
             self._prototypes.append(record.prototypes.float().to(scenes.device))
-        for head in scenes.heads:
-            head.eval()
 
     @property
     def scenes(self) -> Strings:
@@ -86,27 +84,24 @@ class NetworkLocalizer:
         image = as_rgb(image)
         scenes = self.contents
         cameras = _fitting_cameras(camera, image, scenes.scenes)
-        features = scenes.encoder.encode(image, scenes.short_side)
-        encoded = Encoded(features)
-        scenes_tried = self._candidates(encoded, cameras)
+        encoded = Encoded(scenes.encoder.encode(image, scenes.short_side))
         tried = []
-        for scene in scenes_tried:
-            camera = cameras[scene]
-            assert camera, "only scenes whose camera fits are tried"
-            tried.append(self._hypothesis(encoded, scene, camera))
-        best = max(tried, key=_support)
-        return self._answer(best, 1000 * (perf_counter() - began))
+        for scene in self._candidates(encoded, cameras):
+            rough = self._hypothesis(encoded, scene, cameras[scene])
+            if rough:
+                tried.append(rough)
+        milliseconds = 1000 * (perf_counter() - began)
+        if not tried:
+            return PoseEstimate.failed("fewer than 6 inliers", milliseconds)
+        return self._answer(max(tried, key=_support), milliseconds)
 
-    def _candidates(
-        self, encoded: Encoded, cameras: Sequence[Camera | None]
-    ) -> list[int]:
-        """Scenes to try, whose prototypes are most similar to the image's descriptor.
+    def _candidates(self, encoded: Encoded, usable: Collection[int]) -> list[int]:
+        """Usable scenes to try, whose prototypes are most similar to the image's descriptor.
 
         A head that reads the descriptor has one output for all scenes, so only the first is tried.
         """
-        usable = [i for i, camera in enumerate(cameras) if camera]
         _, descriptor = described(encoded.features, self.contents.descriptor)
-        similarity = np.full(len(cameras), -np.inf)
+        similarity = np.full(len(self._prototypes), -np.inf)
         for i in usable:
             similarity[i] = float((self._prototypes[i] @ descriptor).max())
         floor = similarity.max() - self.options.margin
@@ -151,66 +146,57 @@ class NetworkLocalizer:
         valid = np.isfinite(points).all(1)
         return Matches(pixels[valid], points[valid]), len(patches)
 
-    def _answer(self, best: Rough | None, milliseconds: float) -> PoseEstimate:
-        if not best:
-            return PoseEstimate.failed("fewer than 6 inliers", milliseconds)
+    def _answer(self, best: Rough, milliseconds: float) -> PoseEstimate:
         record = self.contents.scenes[best.scene]
-        status, reason = self._status(best, record)
         estimate = PoseEstimate(
-            status=status,
-            reason=reason,
-            scene=None,
-            base_from_camera=None,
-            covariance=None,
+            status="ok",
+            reason="",
+            scene=record.name,
+            base_from_camera=best.pose.pose,
+            covariance=record.covariance_scale * best.pose.covariance,
             inliers=best.inliers,
             inlier_ratio=best.inlier_ratio,
             milliseconds=milliseconds,
-            support=_support(best),
-        )
-        if status != "ok":
-            return estimate
-        covariance = None
-        if self.options.refuses:
-            covariance = record.covariance_scale * best.pose.covariance
-        return replace(
-            estimate,
-            scene=record.name,
-            base_from_camera=best.pose.pose,
-            covariance=covariance,
             pixels=best.pixels,
             points_m=best.points_m,
+            support=_support(best),
         )
-
-    def _status(self, best: Rough, record: SceneRecord):
-        if self.options.refuses and best.inlier_ratio < record.inlier_threshold:
-            share = 100 * best.inlier_ratio
-            need = 100 * record.inlier_threshold
-            reason = f"{share:.0f} % of the patches are inliers, {record.name} needs {need:.0f} %"
-            return "unknown_scene", reason
-        return "ok", ""
+        if not self.options.refuses:
+            return replace(estimate, covariance=None)
+        if best.inlier_ratio >= record.inlier_threshold:
+            return estimate
+        share = 100 * best.inlier_ratio
+        need = 100 * record.inlier_threshold
+        reason = f"{share:.0f} % of the patches are inliers, {record.name} needs {need:.0f} %"
+        refused = PoseEstimate.failed(reason, milliseconds)
+        return replace(
+            refused,
+            status="unknown_scene",
+            inliers=best.inliers,
+            inlier_ratio=best.inlier_ratio,
+            support=_support(best),
+        )
 
 
 def _fitting_cameras(
     camera: Camera | None, image: Image, scenes: Sequence[SceneRecord]
-) -> list[Camera | None]:
-    """Intrinsics of an image in each scene, never guessed; None where its shape does not fit."""
+) -> dict[int, Camera]:
+    """Intrinsics of an image by scene, never guessed; without scenes whose shape does not fit."""
     height, width = image.shape[:2]
-    cameras: list[Camera | None] = list(cameras_in_scenes(camera, image, scenes))
+    fitting = {}
     sizes = []
-    for i, scene in enumerate(scenes):
-        recorded = scene.adjusted_camera
-        sizes.append(f"{scene.name} {recorded.width}x{recorded.height}")
-        if not camera and not recorded.fits(width, height):
-            cameras[i] = None
-    if not any(cameras):
+    for i, own in enumerate(cameras_in_scenes(camera, image, scenes)):
+        recorded = scenes[i].camera
+        sizes.append(f"{scenes[i].name} {recorded.width}x{recorded.height}")
+        if camera or recorded.fits(width, height):
+            fitting[i] = own
+    if not fitting:
         raise InputError(
             f"image {width}x{height}: no scene was recorded at this aspect ratio"
             f" ({', '.join(sizes)}); give the image's intrinsics with `camera`"
         )
-    return cameras
+    return fitting
 
 
-def _support(hypothesis: Rough | None) -> float:
-    if not hypothesis:
-        return 0.0
+def _support(hypothesis: Rough) -> float:
     return hypothesis.inlier_ratio * hypothesis.inliers**0.5

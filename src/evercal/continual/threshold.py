@@ -29,10 +29,8 @@ ACCEPTANCE_FRACTION = 1 / 6
 """Position of the threshold between the inlier ratios of negative and positive images."""
 
 
-def fit_threshold(
-    scenes: LearnedScenes, held_out: Sequence[Frame], index: int = -1
-) -> SceneRecord:
-    """Fit the inlier threshold and covariance scale of a scene, by default the newest.
+def fit_threshold(scenes: LearnedScenes, held_out: Sequence[Frame]) -> SceneRecord:
+    """Fit the inlier threshold and covariance scale of the newest scene.
 
     Positives are held-out training frames; negatives are views of box rooms that were never
     learned. The threshold lies a sixth of the way from the 95 % quantile of the negatives to the
@@ -41,9 +39,9 @@ def fit_threshold(
     six Gaussian dimensions. Returned is the scene's record with both.
     """
     # A threshold that was fitted before must not count twice.
-    records = list(scenes.scenes)
-    records[index] = replace(records[index], inlier_threshold=0.0, covariance_scale=1.0)
-    localizer = NetworkLocalizer(replace(scenes, scenes=records))
+    *earlier, newest = scenes.scenes
+    newest = replace(newest, inlier_threshold=0.0, covariance_scale=1.0)
+    localizer = NetworkLocalizer(replace(scenes, scenes=[*earlier, newest]))
     squared = []
     positives = []
     for frame in held_out:
@@ -55,16 +53,14 @@ def fit_threshold(
         metres, radians = pose_distance(pose.pose, frame.base_from_camera)
         if metres < _NEAR_M and radians < _NEAR_RAD:
             squared.append(pose.squared_mahalanobis(frame.base_from_camera))
-    small = records[index].camera.short_side_resized(scenes.short_side)
+    small = newest.camera.short_side_resized(scenes.short_side)
     others = _negative_views(*small.size)
     negatives = [localizer.localize(image).inlier_ratio for image in others]
     high = float(np.quantile(negatives, 0.95))
     low = float(np.quantile(positives or [1.0], 0.05))
     threshold = high + ACCEPTANCE_FRACTION * max(0.0, low - high)
     scale = float(np.median(squared or [CHI2_6_MEDIAN])) / CHI2_6_MEDIAN
-    return replace(
-        records[index], inlier_threshold=threshold, covariance_scale=max(scale, 1.0)
-    )
+    return replace(newest, inlier_threshold=threshold, covariance_scale=max(scale, 1.0))
 
 
 @lru_cache(maxsize=4)

@@ -173,7 +173,8 @@ def continual_scores(accuracies: ArrayLike) -> ContinualScores:
     """Final accuracy and forgetting of one run over a sequence of scenes; NaN for a single one.
 
     Entry (i, j) of `accuracies` (N, N) is the accuracy after stage i on the scene learned in stage
-    j. Entries above the diagonal are ignored.
+    j. Entries above the diagonal are ignored. With NaN in earlier stages, as of joint training, the
+    final accuracy and that of the last scene are the only numbers.
     """
     matrix = np.asarray(accuracies, float)
     count = len(np.atleast_1d(matrix))
@@ -181,13 +182,12 @@ def continual_scores(accuracies: ArrayLike) -> ContinualScores:
         raise ValueError(
             f"accuracies must be square (stages, scenes), got {matrix.shape}"
         )
-    learned = matrix[np.tril_indices(count)]
-    if not np.isfinite(learned).all():
-        raise ValueError(
-            "accuracies must be finite on and below the diagonal, got inf or nan"
-        )
     last = matrix[-1]
-    along = float(learned.mean())
+    if not np.isfinite(last).all():
+        raise ValueError(
+            "accuracies must be finite after the last stage, got inf or nan"
+        )
+    along = float(matrix[np.tril_indices(count)].mean())
     final = float(last.mean())
     newest = float(last[-1])
     if count == 1:

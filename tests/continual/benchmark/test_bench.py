@@ -23,12 +23,12 @@ from evercal.continual.benchmark.bench import (
 )
 from evercal.continual.benchmark.overlays import OVERLAYS, draw_overlays
 from evercal.continual.benchmark.results import (
+    FRAMES,
     KEY,
     RESULTS,
     SETTINGS,
     STRATEGIES,
     read,
-    read_frames,
 )
 from evercal.continual.learning.presets import on_paper_backbone
 from evercal.continual.methods.replay import Replay
@@ -106,9 +106,12 @@ def test_all_learned_scenes_are_evaluated_after_every_stage(
     complete: Complete,
 ) -> None:
     out, steps = complete
-    names = ["er", "er", "finetune", "finetune", "joint", "joint"]
     assert [(s.strategy, s.done, s.total) for s in steps] == [
-        (name, i, 6) for i, name in enumerate(names, start=1)
+        ("er", 1, 6),
+        ("er", 2, 6),
+        ("finetune", 3, 6),
+        ("finetune", 4, 6),
+        ("joint", 6, 6),
     ]
     stages = [(0, "one"), (1, "one"), (1, "two")]
     expected = [
@@ -116,7 +119,7 @@ def test_all_learned_scenes_are_evaluated_after_every_stage(
     ]
     expected += [("joint", 1, "one"), ("joint", 1, "two")]
     results = read(out)
-    frames = read_frames(out)
+    frames = pd.read_csv(out / FRAMES)
     rows = results[["strategy", "stage", "scene"]]
     assert list(rows.itertuples(index=False, name=None)) == expected
     assert (results["frames"] == 3).all()
@@ -159,7 +162,7 @@ def test_processes_share_the_runs(
     assert next(first).strategy == "er"
     second = run_bench(arcs, options, tmp_path)
     assert next(second).strategy == "finetune"
-    assert [step.strategy for step in first] == ["er", "joint", "joint"]
+    assert [step.strategy for step in first] == ["er", "joint"]
     assert [step.strategy for step in second] == ["finetune"]
     pd.testing.assert_frame_equal(comparable(tmp_path), comparable(complete[0]))
 
@@ -322,9 +325,8 @@ def test_backbone_of_the_paper_gets_all_centres_in_advance(
 
     paper = replace(options, stage=stage, strategies=named("sars_spdd", "joint"))
     steps = list(run_bench(arcs, paper, tmp_path))
-    assert [s.strategy for s in steps] == [
-        s.name for s in paper.strategies for _ in arcs
-    ]
+    names = ["sars_spdd", "sars_spdd", "joint"]
+    assert [step.strategy for step in steps] == names
     first = NetworkStore.open(tmp_path / "runs" / "first-one-0").contents
     assert len(first.heads[0].centres) == 5
     assert first.scenes[0].cell.side_m == 5.0

@@ -12,7 +12,6 @@ from evercal.continual.benchmark.comparison import (
     NEWEST,
     TFR,
     complete_runs,
-    continual,
     contrast_table,
     gate,
     matrix,
@@ -22,6 +21,7 @@ from evercal.continual.benchmark.comparison import (
     thresholds,
 )
 from evercal.errors import InputError
+from evercal.evaluation.metrics import continual_scores
 
 from .results_by_hand import JOINT, OURS, THEIRS, table
 
@@ -33,7 +33,7 @@ def test_accuracy_matrix_and_its_scores() -> None:
     assert list(accuracies.columns) == ["b", "a"]
     np.testing.assert_allclose(accuracies.to_numpy()[np.tril_indices(2)], [80, 70, 60])
     assert math.isnan(accuracies.iloc[0, 1])  # pyright: ignore[reportArgumentType]
-    scores = continual(accuracies)
+    scores = continual_scores(accuracies)
     assert scores.final_accuracy == pytest.approx(65)
     assert scores.total_forgetting == scores.forgetting == pytest.approx(10)
     assert scores.backward_transfer == pytest.approx(-10)

@@ -14,8 +14,6 @@ from evercal.continual.benchmark.results import (
     append,
     frame_row,
     read,
-    read_frames,
-    run_of,
     scene_row,
 )
 from evercal.errors import InputError
@@ -31,36 +29,37 @@ TESTS = pd.DataFrame(
 )
 
 
+def frames_in(folder: Path) -> pd.DataFrame:
+    return pd.read_csv(folder / FRAMES, dtype={"frame": str})
+
+
 def stage(number: int) -> StageResults:
     return StageResults(number, (FIRST, LAST)[number], TESTS if number else TESTS[:0])
 
 
 def test_results_round_trip(tmp_path: Path) -> None:
     assert read(tmp_path).empty
-    assert read_frames(tmp_path).empty
     append(tmp_path, stage(0))
     append(tmp_path, stage(1))
     whole: pd.DataFrame = pd.concat([FIRST, LAST], ignore_index=True)  # pyright: ignore
     pd.testing.assert_frame_equal(read(tmp_path), whole)
-    pd.testing.assert_frame_equal(read_frames(tmp_path), TESTS)
-    assert len(run_of(read(tmp_path), "ours", 0)) == 3
-    assert run_of(read(tmp_path), "ours", 1).empty
-
-
-def test_compressed_files_are_read(tmp_path: Path) -> None:
-    TESTS.to_csv(tmp_path / f"{FRAMES}.gz", index=False)
-    pd.testing.assert_frame_equal(read_frames(tmp_path), TESTS)
+    pd.testing.assert_frame_equal(frames_in(tmp_path), TESTS)
 
 
 def test_incomplete_last_line_is_removed_and_written_again(tmp_path: Path) -> None:
     append(tmp_path, stage(0))
     append(tmp_path, stage(1))
-    path = tmp_path / RESULTS
-    path.write_bytes(path.read_bytes()[:-40])
+    whole = read(tmp_path)
+    for name in (RESULTS, FRAMES):
+        path = tmp_path / name
+        path.write_bytes(path.read_bytes()[:-5])
     assert len(read(tmp_path)) == 2
     append(tmp_path, stage(1))
-    assert len(read(tmp_path)) == 3
-    assert len(read_frames(tmp_path)) == 3, "frames are not doubled"
+    pd.testing.assert_frame_equal(read(tmp_path).reset_index(drop=True), whole)
+    frames = frames_in(tmp_path)
+    assert len(frames) == 2 + 3
+    again = frames.drop_duplicates(["scene", "frame"], keep="last", ignore_index=True)
+    pd.testing.assert_frame_equal(again, TESTS)
 
 
 def test_other_tables_are_refused(tmp_path: Path) -> None:

@@ -29,7 +29,8 @@ def rows(count: int, scene: int = 0) -> Rows:
         torch.eye(4)[:3].repeat(count, 1, 1),
     )
     which = torch.full((count,), scene)
-    return Rows(torch.zeros(count, 1), which, torch.zeros(count, 1), target)
+    known = torch.full((count, 3), torch.nan)
+    return Rows(torch.zeros(count, 1), which, torch.zeros(count, 1), target, known)
 
 
 def off_by(pixels: float) -> list[float]:

@@ -1,6 +1,8 @@
 """SPDD against calculations in plain Python."""
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,6 +14,7 @@ from evercal.continual.networks.head import HeadOutput
 from ..draws import seeded
 
 INF = math.inf
+WEIGHTS = ("prior_weight", "metric_weight", "output_weight")
 
 
 def head_output(logits: Tensor, offsets: Tensor, points: Tensor) -> HeadOutput:
@@ -36,6 +39,24 @@ def random_output(rows, centres, seed, shared=False):
 def softmax(values, temperature):
     powers = [math.exp(v / temperature) for v in values]
     return [p / sum(powers) for p in powers]
+
+
+def spdd_terms(student, teacher, options):
+    """The loss, and its terms without their weights."""
+
+    def term(*weights):
+        return spdd_loss(
+            student,
+            teacher,
+            replace(options, **dict(zip(WEIGHTS, weights, strict=True))),
+        )
+
+    return SimpleNamespace(
+        prior=term(1.0, 0.0, 0.0),
+        metric=term(0.0, 1.0, 0.0),
+        output=term(0.0, 0.0, 1.0),
+        total=spdd_loss(student, teacher, options),
+    )
 
 
 def slow_terms(student, teacher, active, temperature):
@@ -69,7 +90,7 @@ def test_terms_match_a_slow_reference(new, active, temperature):
     teacher = random_output(6, 9, 0)
     student = random_output(6, 9 + new, 1)
     options = SpddOptions(2.0, 3.0, 5.0, temperature, active)
-    terms = spdd_loss(student, teacher, options)
+    terms = spdd_terms(student, teacher, options)
     prior, metric, output = slow_terms(student, teacher, active, temperature)
     assert terms.prior.item() == pytest.approx(prior, rel=1e-10)
     assert terms.metric.item() == pytest.approx(metric, rel=1e-10)
@@ -91,12 +112,12 @@ def test_probability_of_a_new_centre_is_charged():
         selected = sum(math.exp(z / 2) for z in sorted(row)[-4:])
         expected += 4 * -math.log(selected / (selected + math.exp(logit / 2))) / 5
     options = SpddOptions(active_centres=4)
-    terms = spdd_loss(student, teacher, options)
+    terms = spdd_terms(student, teacher, options)
     assert terms.prior.item() == pytest.approx(expected, rel=1e-10)
     assert expected > 0.1
 
     student.logits.requires_grad_()
-    spdd_loss(student, teacher, options).prior.backward()
+    spdd_terms(student, teacher, options).prior.backward()
     gradient = student.logits.grad
     assert gradient is not None
     assert (
@@ -109,7 +130,7 @@ def test_shared_offsets():
     teacher = random_output(2, 4, 1)
     teacher.offsets = tensor([[[0.0, 1.0, 2.0]], [[3.0, 3.0, 3.0]]])
     student.offsets = tensor([[[0.5, 1.0, 0.0]], [[3.0, 2.0, 3.0]]])
-    terms = spdd_loss(student, teacher, SpddOptions())
+    terms = spdd_terms(student, teacher, SpddOptions())
     assert terms.metric.item() == pytest.approx((2.5 + 1.0) / 2)
 
 
@@ -120,7 +141,7 @@ def test_gradients(new, shared):
     start = random_output(3, 6 + new, 13, shared)
 
     def total(logits, offsets, points):
-        return spdd_loss(
+        return spdd_terms(
             head_output(logits, offsets, points), teacher, SpddOptions(1, 2, 3)
         ).total
 
@@ -145,7 +166,7 @@ def test_masked_centres_give_finite_gradients(dtype, temperature):
     leaves = [
         x.requires_grad_() for x in (student.logits, student.offsets, student.points)
     ]
-    terms = spdd_loss(student, teacher, SpddOptions(temperature=temperature))
+    terms = spdd_terms(student, teacher, SpddOptions(temperature=temperature))
     terms.total.backward()
     assert math.isfinite(terms.total.item())
     for leaf in leaves:
@@ -162,7 +183,7 @@ def test_masked_centre_equals_missing_centre(who):
     student = random_output(3, 9, 19)
     teacher.logits[:, 4] = 20.0  # the largest logit
     keep = [k for k in range(9) if k != 4]
-    without = spdd_loss(
+    without = spdd_terms(
         head_output(student.logits[:, keep], student.offsets[:, keep], student.points),
         head_output(
             teacher.logits[:, keep[:6]], teacher.offsets[:, keep[:6]], teacher.points
@@ -173,7 +194,7 @@ def test_masked_centre_equals_missing_centre(who):
         teacher.logits[:, 4] = -INF
     if who != "teacher":
         student.logits[:, 4] = -INF
-    masked = spdd_loss(student, teacher, SpddOptions())
+    masked = spdd_terms(student, teacher, SpddOptions())
     assert masked.total.item() == pytest.approx(without.total.item(), rel=1e-12)
 
 
@@ -182,7 +203,7 @@ def test_at_most_fifty_centres_are_active(centres):
     teacher = random_output(3, centres, 22)
     student = random_output(3, centres, 23)
     student.offsets.requires_grad_()
-    spdd_loss(student, teacher, SpddOptions()).metric.backward()
+    spdd_terms(student, teacher, SpddOptions()).metric.backward()
     assert student.offsets.grad is not None
     active = (student.offsets.grad.abs().sum(2) > 0).sum(1)
     assert active.tolist() == [min(50, centres)] * 3

@@ -49,21 +49,20 @@ def buffer_of(device: torch.device, scene: int = 1) -> FeatureBuffer:
             "descriptors": torch.nn.functional.normalize(normal(2, 4, seed=3)),
         }
     )
-    buffer.known = normal(40, 3, seed=4).half().to(device)
+    buffer.known = normal(40, 3, seed=4).to(device)
     return buffer
 
 
 def drawn(buffers: list[FeatureBuffer]) -> Rows:
     generator = seeded(1)
     plain = buffer_of(buffers[0].device)
-    plain.known = None
+    plain.known = FeatureBuffer(0, SE3.identity(), buffers[0].device).known
     return join(
         [*(buffer.draw(16, generator) for buffer in buffers), plain.draw(8, generator)]
     )
 
 
 def everything(rows: Rows) -> dict[str, Tensor]:
-    assert rows.known is not None
     fields = (rows.features, rows.scene, rows.descriptor, rows.known)
     names = ("features", "scene", "descriptor", "stored")
     target = rows.target

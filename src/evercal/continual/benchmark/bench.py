@@ -46,14 +46,14 @@ from evercal.typing import JsonObject
 
 @frozen
 class CompletedStage:
-    """A complete stage."""
+    """A complete stage; joint training has the last one only."""
 
     strategy: str
     """Name of the strategy."""
     seed: int
     """Seed of the run."""
     results: Table
-    """Rows of results.csv; empty before the last stage of joint training."""
+    """Rows of results.csv."""
     done: int
     """Complete stages, including those of earlier calls."""
     total: int
@@ -114,8 +114,9 @@ def begin_bench(
 
 
 def _is_complete(stored: Table, strategy: Strategy, seed: int, scenes: int) -> bool:
-    rows = results.run_of(stored, strategy.name, seed)
-    return bool((rows["stage"] == scenes - 1).sum() == scenes)
+    rows = stored[stored["strategy"] == strategy.name]
+    last = (rows["seed"] == seed) & (rows["stage"] == scenes - 1)
+    return bool(last.sum() == scenes)
 
 
 def _record_strategies(out: Path, strategies: Sequence[Strategy]) -> None:

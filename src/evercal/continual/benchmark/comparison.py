@@ -9,7 +9,7 @@ import pandas as pd
 from evercal.classes import frozen
 from evercal.continual.benchmark.results import Table
 from evercal.errors import InputError
-from evercal.evaluation.metrics import ContinualScores, continual_scores
+from evercal.evaluation.metrics import continual_scores
 from evercal.typing import Pair
 
 FINAL = "final %"
@@ -94,8 +94,8 @@ def _scores(run: Table, suite: str) -> dict[str, float]:
     if with_covariance:
         inside = 100 * last["inside_95"].sum() / with_covariance
     threshold, other = thresholds(suite)
-    judged = continual(matrix(run, threshold))
-    beside = continual(matrix(run, other))
+    judged = continual_scores(matrix(run, threshold))
+    beside = continual_scores(matrix(run, other))
     memory_mb = last["memory_bytes"].iloc[0] / 1e6
     if math.isnan(judged.total_forgetting):  # joint training needs all frames again
         memory_mb = math.nan
@@ -126,17 +126,6 @@ def matrix(run: Table, threshold: Threshold) -> Table:
     shares = run.assign(share=percent)
     accuracies = shares.pivot_table(index="stage", columns="scene", values="share")
     return accuracies.reindex(index=range(len(scenes)), columns=scenes)
-
-
-def continual(accuracies: Table) -> ContinualScores:
-    """Return final accuracy and forgetting; forgetting is NaN for joint training."""
-    values = accuracies.to_numpy(float)
-    measured = values[np.tril_indices(len(values))]
-    if np.isfinite(measured).all():
-        return continual_scores(values)
-    nan = math.nan
-    last = values[-1]
-    return ContinualScores(float(last.mean()), nan, nan, nan, float(last[-1]), nan)
 
 
 def method_table(scores: Table) -> Table:

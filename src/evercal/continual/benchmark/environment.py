@@ -33,7 +33,6 @@ def environment() -> dict[str, str]:
         "torch": torch.__version__,
         "numpy": np.__version__,
         "processor": _processor(),
-        "instructions": torch.backends.cpu.get_cpu_capability(),
         "precision": precision,
         "threads": str(torch.get_num_threads()),
         "gpu": gpu,

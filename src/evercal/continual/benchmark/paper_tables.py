@@ -59,11 +59,11 @@ def published(suite: str) -> Table:
 
 
 def paper_table(results: Table, suite: str = "") -> Table:
-    """Tabulate final median errors and accuracies by scene, then mean and TFR, means over runs.
+    """Tabulate median errors and accuracies of complete runs by scene, then mean and TFR.
 
-    Accuracy and TFR are at the threshold of the suite. The published rows follow if there are any.
+    Values are means over runs, after the last stage. Accuracy and TFR are at the threshold of the
+    suite. The published rows follow if there are any.
     """
-    results = comparison.complete_runs(results)
     last = comparison.last_stage(results)
     threshold, _ = comparison.thresholds(suite)
     cells: Table = pd.DataFrame(

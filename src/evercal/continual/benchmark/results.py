@@ -3,8 +3,8 @@
     OUT/results.csv    a row per strategy, seed, stage and scene: correct frames, errors, memory
     OUT/frames.csv     a row per test frame after the last stage: errors and what became of it
 
-Accuracy matrices, forgetting and intervals are derived from these. Either file may be compressed
-(`frames.csv.gz`).
+Accuracy matrices, forgetting and intervals are derived from these. After an interruption a row may
+be there twice; the last one counts.
 """
 
 import hashlib
@@ -12,6 +12,7 @@ import json
 import math
 import os
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +52,6 @@ WITHIN = {
 """Columns that count correct frames: metres and radians, both errors strictly below."""
 KEY = ["strategy", "seed", "stage", "scene"]
 """Columns that identify a row of results.csv."""
-_FRAME_KEY = ["strategy", "seed", "scene", "frame"]
-"""Columns that identify a row of frames.csv."""
 _REQUIRED = {
     *KEY,
     "frames",
@@ -72,7 +71,7 @@ class StageResults:
     stage: int
     """Number of the stage, from 0."""
     results: Table
-    """Rows of results.csv; empty before the last stage of joint training."""
+    """Rows of results.csv."""
     frames: Table
     """Rows of frames.csv; empty before the last stage."""
 
@@ -131,70 +130,44 @@ def locked(folder: Path) -> FileLock:
 
 
 def append(folder: Path, stage: StageResults) -> None:
-    """Append the rows of a stage that a folder lacks, and flush them to disk."""
-    before = read(folder)
-    new = stage.results
-    # An interrupted call may have stored some rows of the stage.
-    if len(before) and len(new):
-        stored = pd.MultiIndex.from_frame(before[KEY])
-        new = new[~pd.MultiIndex.from_frame(new[KEY]).isin(stored)]
+    """Append the rows of a stage, and flush them to disk."""
     with locked(folder):
         # Frames come first: a stage whose results are complete has its frames.
         _append_rows(folder / FRAMES, stage.frames)
-        _append_rows(folder / RESULTS, new)
+        _append_rows(folder / RESULTS, stage.results)
 
 
 def _append_rows(path: Path, rows: Table) -> None:
     if rows.empty:
         return
-    with open(path, "a", encoding="utf-8") as file:
-        rows.to_csv(file, header=file.tell() == 0, index=False)
+    with open(path, "a+b") as file:
+        file.seek(0)
+        lines, newline, _ = file.read().rpartition(b"\n")
+        file.truncate(len(lines + newline))  # an interrupted call left part of a line
+        file.write(rows.to_csv(header=not lines, index=False).encode())
         file.flush()
         os.fsync(file.fileno())
 
 
-def run_of(results: Table, strategy: str, seed: int) -> Table:
-    """Return the rows of a run."""
-    return results[(results["strategy"] == strategy) & (results["seed"] == seed)]
-
-
 def read(folder: Path) -> Table:
     """Read the results of a folder; without any, an empty table."""
-    return _read(folder, RESULTS, _REQUIRED).drop_duplicates(KEY, keep="last")
-
-
-def read_frames(folder: Path) -> Table:
-    """Read the test frames of a folder after the last stage; without any, an empty table."""
-    frames = _read(folder, FRAMES, {*_FRAME_KEY, "error_mm", "error_deg", "outcome"})
-    return frames.drop_duplicates(_FRAME_KEY, keep="last")
-
-
-def _read(folder: Path, name: str, required: set[str]) -> Table:
-    path = min(folder.glob(f"{name}*"), default=None)
-    if not path:
-        return pd.DataFrame(columns=sorted(required))
-    if path.name == name:
-        _remove_incomplete_line(folder, path)
+    path = folder / RESULTS
+    if not path.exists():
+        return pd.DataFrame(columns=sorted(_REQUIRED))
     try:
-        table = pd.read_csv(
-            path,
-            dtype=dict.fromkeys(("strategy", "scene", "frame", "environment"), "str"),
+        lines, newline, _ = path.read_bytes().rpartition(b"\n")
+        table: Table = pd.read_csv(
+            BytesIO(lines + newline),
+            dtype=dict.fromkeys(("strategy", "scene", "environment"), "str"),
             keep_default_na=False,  # a scene may be called `nan`
             na_values=[""],
         )
     except (ValueError, OSError) as error:
         raise InputError(f"{path}: not a table of results ({error})") from error
-    missing = required.difference(table)
+    missing = _REQUIRED.difference(table)
     if missing:
         raise InputError(f"{path}: no columns {', '.join(sorted(missing))}")
-    return table
-
-
-def _remove_incomplete_line(folder: Path, path: Path) -> None:
-    # An interrupted call left it.
-    with locked(folder), open(path, "r+b") as file:
-        data = file.read()
-        file.truncate(data.rfind(b"\n") + 1)
+    return table.drop_duplicates(KEY, keep="last")
 
 
 def record_environment(folder: Path) -> str:

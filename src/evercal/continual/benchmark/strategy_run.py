@@ -139,8 +139,7 @@ class _Run:
             if last:
                 frames += [run | frame_row(frame) for frame in of_scene]
                 record_overlay(self.out, self.strategy.name, scene, of_scene)
-        table = pd.DataFrame(frames)
-        return StageResults(number, pd.DataFrame(results), table)
+        return StageResults(number, pd.DataFrame(results), pd.DataFrame(frames))
 
 
 class _MapRun(_Run):
@@ -151,14 +150,13 @@ class _MapRun(_Run):
             self._remove()  # left by an interrupted commit
         for number in range(max(0, len(self._opened().stages) - 1), len(self.scenes)):
             opened = self._opened()
-            contents = opened.contents
-            cache_features(contents.encoder, self.features)
+            cache_features(opened.contents.encoder, self.features)
             if number >= len(opened.stages):
                 memory = self.stage.memory
                 size = memory.bytes or f"{100 * memory.share:g}%"
-                scene, report = learn_scene(self.scenes[number], contents, size)
+                scene, report = learn_scene(self.scenes[number], opened.contents, size)
                 opened.commit(scene, report.to_dict())
-                contents = opened.contents
+            contents = opened.contents
             costs = {
                 "seconds": float(opened.reports()[-1]["seconds"]),
                 "memory_bytes": contents.memory_bytes,
@@ -195,11 +193,7 @@ class _NetworkRun(_Run):
         began = perf_counter()
         learned = learn_jointly(empty, self.scenes, self.stage, self.on_event, folder)
         seconds = perf_counter() - began
-        last = len(self.scenes) - 1
-        nothing = pd.DataFrame()
-        for number in range(last):
-            yield StageResults(number, nothing, nothing)
-        yield self._located(learned, last, seconds)
+        yield self._located(learned, len(self.scenes) - 1, seconds)
         (folder / CHECKPOINT).unlink(missing_ok=True)
 
     def _learn(self, store: Path, scene: Recording, strategy: Strategy) -> None:

@@ -46,9 +46,7 @@ def run_tuning(
     table = tuned(out)
     for strategy in options.strategies:
         weights[strategy] = beyond(table.loc[strategy.name, "auc_20cm"][:5])
-    further = _trials(weights)
-    if further:
-        yield from run_bench(scenes, replace(options, strategies=further), out)
+    yield from run_bench(scenes, replace(options, strategies=_trials(weights)), out)
     write_bytes(out / TUNED, tuned(out).to_csv().encode())
 
 

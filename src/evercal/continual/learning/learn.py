@@ -52,7 +52,7 @@ def learn(
     after = scenes.copy_for_training()
     teacher = None
     if after.heads:
-        teacher = copy.deepcopy(after.heads[-1]).eval()
+        teacher = copy.deepcopy(after.heads[-1])
     rows = StageRows(after, options, on_event)
     atlas = after.atlas(options.grid_scenes)
     cell, buffer = _begun(rows, atlas, recording, method.head_per_scene)
@@ -202,7 +202,7 @@ def finish_scene(
     if head.options.condition == "descriptor":
         diffusion = options.fit.diffusion
     remembered = partial(StageRows(scenes, options).of_keyframes, newest)
-    finished = FinishedScene(head.eval(), local, rows, remembered, diffusion)
+    finished = FinishedScene(head, local, rows, remembered, diffusion)
     scenes.method_states.append(method.after_scene(finished))
 
 

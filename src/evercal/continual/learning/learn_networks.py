@@ -20,7 +20,7 @@ from evercal.continual.learning.stage import (
 from evercal.continual.networks.device import device_of
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.store import NetworkStore, head_bytes
-from evercal.continual.strategies import Strategy, strategy_named
+from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.continual.threshold import fit_threshold
 from evercal.errors import InputError
 from evercal.learning.report import LearnReport
@@ -64,8 +64,8 @@ class NetworkReport(LearnReport):
 class NetworkLearnOptions:
     """How a scene is learned into a store of networks."""
 
-    strategy: str | Strategy = "sars_pixels"
-    """The strategy or its name; a store keeps the one it was made with."""
+    strategy: Strategy = STRATEGIES["sars_pixels"]
+    """The strategy; a store keeps the one it was made with."""
     stage: StageOptions = field(default_factory=partial(preset, "fast"))
     """Options of the stage."""
     preset: str = "fast"
@@ -138,20 +138,6 @@ def _posed(recording: Recording, strategy: Strategy) -> Recording:
     return recording
 
 
-class _Last:
-    """Passes events on, and keeps the last step."""
-
-    step: Progress
-
-    def __init__(self, on_event: OnEvent):
-        self._on_event = on_event
-
-    def __call__(self, event: Encoding | Progress) -> None:
-        if isinstance(event, Progress):
-            self.step = event
-        self._on_event(event)
-
-
 def learn_networks(
     store: Path,
     recording: Recording,
@@ -162,18 +148,10 @@ def learn_networks(
 
     The same call goes on where it was interrupted, with the folder `.STORE.learning` beside the
     store. The folder is removed when the scene is complete.
-
-    Args:
-        store: folder of the store; created if it is missing.
-        recording: its training frames are learned; by default a few are held out.
-        options: strategy and amount of training.
-        on_event: called with every event, for progress bars.
     """
     began = perf_counter()
     stage = options.stage
     strategy = options.strategy
-    if isinstance(strategy, str):
-        strategy = strategy_named(strategy)
     opened = options.opened(store, strategy, recording.train)
     assert strategy.method, "that of a network"
     with opened.writing():
@@ -189,8 +167,15 @@ def learn_networks(
         if options.holds_out:
             split = split_held_out(recording.train)
         train = replace(recording, train=split.train)
-        last = _Last(on_event)
-        learned = learn(contents, strategy.method, train, stage, last, folder)
+        steps: list[Progress] = []
+
+        def observed(event: Encoding | Progress) -> None:
+            if isinstance(event, Progress):
+                steps[:] = [event]
+            on_event(event)
+
+        learned = learn(contents, strategy.method, train, stage, observed, folder)
+        [last] = steps
         if split.held_out:
             learned.scenes[-1] = fit_threshold(learned, split.held_out)
         report = NetworkReport(
@@ -201,8 +186,8 @@ def learn_networks(
             train_frames=len(split.train),
             held_out_frames=len(split.held_out),
             iterations=stage.fit.iterations,
-            loss=last.step.loss,
-            inlier_share=last.step.inlier_share,
+            loss=last.loss,
+            inlier_share=last.inlier_share,
             preset=options.preset,
             strategy={"name": strategy.name, **strategy.description()},
             seed=stage.seed,

@@ -10,11 +10,7 @@ import torch
 from torch import Tensor
 
 from evercal.continual.networks.buffer import FeatureBuffer
-from evercal.continual.networks.feature_cache import (
-    encoder_key,
-    read_cached,
-    write_cached,
-)
+from evercal.continual.networks.feature_cache import cached, encoder_key
 from evercal.features.encoder import Encoder
 from evercal.mapping.pose_check import depth_scale, matched_pairs
 from evercal.mapping.prepared_frames import PreparedFrames, WorkingSize
@@ -88,9 +84,11 @@ def shared_depths(
 ) -> list[Array]:
     """Estimate the depths of frames, see `frame_depths`, or read those of an earlier run.
 
-    `cache` is the folder of the depths of all runs; without one they are always estimated.
+    `cache` is the folder of the depths of all runs. Without one, or with frames of several sizes,
+    they are always estimated.
     """
-    if not cache:
+    sizes = {frame.camera.size for frame in frames}
+    if not cache or len(sizes) > 1:
         return frame_depths(frames, encoder, short_side)
     key = hashlib.blake2b(digest_size=16)
     poses = stated_poses(frames).matrix()
@@ -98,15 +96,11 @@ def shared_depths(
         key.update(f"{frame.name} {frame.camera} {short_side}".encode())
         key.update(pose.tobytes())
     key.update(encoder_key(encoder).encode())
-    path = cache / f"depths-{key.hexdigest()}.npy"
-    cached = read_cached(path)
-    if cached is not None:
-        return list(cached)
-    depths = frame_depths(frames, encoder, short_side)
-    if len({depth.shape for depth in depths}) == 1:
-        cache.mkdir(parents=True, exist_ok=True)
-        write_cached(path, np.stack(depths))
-    return depths
+
+    def estimated() -> Array:
+        return np.stack(frame_depths(frames, encoder, short_side))
+
+    return list(cached(cache / f"depths-{key.hexdigest()}.npy", estimated))
 
 
 def surface_points(

@@ -7,7 +7,8 @@ from torch import Generator, Tensor
 
 from evercal.classes import frozen
 from evercal.continual.methods.method import FinishedScene, Method, StageStart
-from evercal.continual.networks.buffer import random_indices
+from evercal.continual.networks.buffer import Rows, random_indices
+from evercal.continual.networks.head import HeadOutput
 from evercal.continual.networks.hooks import TrainingHooks
 from evercal.continual.networks.loss import fixed_clamp_loss
 
@@ -55,7 +56,7 @@ class _TiedWeights(TrainingHooks):
         for state in start.states:
             self._ties.append({k: v.to(start.head.code) for k, v in state.items()})
 
-    def regularizer(self) -> Tensor | None:
+    def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
         if not self._ties:
             return None
         cost = torch.zeros((), device=self._head.device)

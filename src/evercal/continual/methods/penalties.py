@@ -170,4 +170,4 @@ class Distillation(Penalty):
         self, student: HeadOutput, teacher: HeadOutput, rows: Rows, tau_px: float
     ) -> Tensor:
         """Compute the loss in metres and nats."""
-        return spdd_loss(student, teacher, self.options).total
+        return spdd_loss(student, teacher, self.options)

@@ -34,26 +34,11 @@ class SpddOptions:
         require_numbers(self, ("active_centres",), 1)
 
 
-@frozen
-class SpddTerms:
-    """The terms of the loss, each a scalar without its weight, and their weighted sum."""
-
-    prior: Tensor
-    """Divergence of centre probabilities, nats."""
-    metric: Tensor
-    """Distance of offsets, metres."""
-    output: Tensor
-    """Distance of points, metres."""
-    total: Tensor
-
-
-def spdd_loss(
-    student: HeadOutput, teacher: HeadOutput, options: SpddOptions
-) -> SpddTerms:
+def spdd_loss(student: HeadOutput, teacher: HeadOutput, options: SpddOptions) -> Tensor:
     """Compute the distillation loss of a student against a teacher on the same rows.
 
     The active set A of a row contains its M_a highest teacher logits. A centre that either head
-    masks (logit -inf) is never active. The terms are
+    masks (logit -inf) is never active. The loss is the weighted sum of
 
     - prior: ``tau^2 KL(p_T || p_S)``. The teacher's softmax ``p_T`` is over A. The student's
       softmax ``p_S`` is over A and over the centres N that the teacher does not have. With s the
@@ -86,16 +71,12 @@ def spdd_loss(
         metric = gap.masked_fill(dead[:, :, None], 0.0).abs()
     output = (student.points - teacher.points.detach()).abs()
 
-    scale = 1.0 / max(rows, 1)
-    prior = prior.sum() * scale
-    metric = metric.sum() * scale
-    output = output.sum() * scale
     total = (
-        options.prior_weight * prior
-        + options.metric_weight * metric
-        + options.output_weight * output
+        options.prior_weight * prior.sum()
+        + options.metric_weight * metric.sum()
+        + options.output_weight * output.sum()
     )
-    return SpddTerms(prior=prior, metric=metric, output=output, total=total)
+    return total / max(rows, 1)
 
 
 def _prior(

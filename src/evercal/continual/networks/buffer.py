@@ -32,7 +32,7 @@ class Rows:
     descriptor: Tensor
     """(n, width) descriptor of each row's image."""
     target: Target
-    known: Tensor | None = None
+    known: Tensor
     """(n, 3) points of the atlas that are known from depths; NaN for rows without one."""
 
     def part(self, where: slice | Tensor) -> "Rows":
@@ -43,15 +43,11 @@ class Rows:
 def _combined(
     batches: Sequence[Rows], change: Callable[[list[Tensor]], Tensor]
 ) -> Rows:
-    """Change every column of batches; known points are those of the batches that have some."""
+    """Change every column of batches."""
 
     def changed(name: str) -> Tensor:
         return change(list(map(attrgetter(name), batches)))
 
-    known = None
-    with_points = [batch.known for batch in batches if batch.known is not None]
-    if with_points:
-        known = change(with_points)
     return Rows(
         features=changed("features"),
         scene=changed("scene"),
@@ -61,7 +57,7 @@ def _combined(
             intrinsics=changed("target.intrinsics"),
             camera_from_atlas=changed("target.camera_from_atlas"),
         ),
-        known=known,
+        known=changed("known"),
     )
 
 
@@ -86,8 +82,8 @@ class FeatureBuffer:
         self.atlas_from_base = atlas_from_base
         self.device = torch.device(device)
         self.views = 0
-        self.known: Tensor | None = None
-        """(rows, 3) known points, on the buffer's device, see `Rows.known`."""
+        self.known = torch.full((1, 3), torch.nan, device=self.device)
+        """(rows, 3) known points on the buffer's device, or (1, 3) for all; see `Rows.known`."""
         self.planned = 0
         """Rows for which memory is reserved at once, so that no second copy is needed."""
         self._columns: dict[str, tuple[Tensor, int]] = {}
@@ -156,9 +152,6 @@ class FeatureBuffer:
         tensors = self.tensors
         index = index.to(tensors["view"].device)
         view = tensors["view"][index].long()
-        known = None
-        if self.known is not None:
-            known = self.known[index].float()
         return Rows(
             features=tensors["features"][index],
             scene=torch.full((len(index),), self.scene, device=index.device),
@@ -168,7 +161,7 @@ class FeatureBuffer:
                 intrinsics=tensors["intrinsics"][view],
                 camera_from_atlas=tensors["camera_from_atlas"][view],
             ),
-            known=known,
+            known=self.known.expand(len(self), 3)[index],
         )
 
 
@@ -178,19 +171,10 @@ def random_indices(count: int, size: int, generator: Generator) -> Tensor:
 
 
 def join(batches: Sequence[Rows]) -> Rows:
-    """Concatenate batches; rows of those without known points have NaN if others have some."""
+    """Concatenate batches."""
     if len(batches) == 1:
         return batches[0]
-    joined = _combined(batches, torch.cat)
-    if joined.known is None:
-        return joined
-    columns = []
-    for batch in batches:
-        known = batch.known
-        if known is None:
-            known = joined.known.new_full((len(batch.scene), 3), torch.nan)
-        columns.append(known)
-    return replace(joined, known=torch.cat(columns))
+    return _combined(batches, torch.cat)
 
 
 def diffused(rows: Rows, deviation: float, generator: Generator) -> Rows:

@@ -91,16 +91,10 @@ def load_descriptor(path: Path = DESCRIPTOR_FILE) -> Descriptor:
         if settings.pop("layout", None) == PooledDescriptor.__name__:
             layout = PooledDescriptor
         descriptor = layout(**settings)
-    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+        descriptor.load_state_dict(state)
+    except (SafetensorError, LookupError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(
             f"descriptor {path}: not an evercal descriptor ({error!r})"
-        ) from error
-    try:
-        descriptor.load_state_dict(state)
-    except RuntimeError as error:
-        first = str(error).splitlines()[1].strip()  # line 0 is the class of the module
-        raise InputError(
-            f"descriptor {path}: not an evercal descriptor: {first}"
         ) from error
     return descriptor.eval()
 

@@ -39,18 +39,16 @@ def row_encoder(
         return encoded
     key = hashlib.blake2b(descriptor_bytes(descriptor), digest_size=4)
     folder = cache / f"{encoder_key(encoder)}-{key.hexdigest()}"
-    folder.mkdir(parents=True, exist_ok=True)
 
     def read(grey: Image, keep: BoolArray) -> tuple[Tensor, Tensor]:
-        key = hashlib.blake2b(grey.tobytes() + keep.tobytes(), digest_size=16)
-        path = folder / f"{key.hexdigest()}.npy"
-        stored = read_cached(path)
-        if stored is None:
+        def computed() -> NDArray[Any]:
             features, vector = encoded(grey, keep)
             # The descriptor keeps its single precision: two halves a channel.
             halves = vector.numpy().view(np.float16)
-            stored = np.concatenate([features.numpy().ravel(), halves])
-            write_cached(path, stored)
+            return np.concatenate([features.numpy().ravel(), halves])
+
+        key = hashlib.blake2b(grey.tobytes() + keep.tobytes(), digest_size=16)
+        stored = cached(folder / f"{key.hexdigest()}.npy", computed)
         count = int(keep.sum()) * encoder.width
         features, halves = np.split(stored, [count])
         features = torch.from_numpy(features.reshape(-1, encoder.width))
@@ -66,19 +64,15 @@ def cache_features(encoder: Encoder, folder: Path) -> None:
     may be deleted at any time. The encoder is changed in place.
     """
     folder = folder / encoder_key(encoder)
-    folder.mkdir(parents=True, exist_ok=True)
     compute = encoder.function
 
-    def cached(grey: Float32Array) -> Array:
+    def read(grey: Float32Array) -> Array:
         digest = hashlib.blake2b(grey.tobytes(), digest_size=16).hexdigest()
         path = folder / f"{'x'.join(map(str, grey.shape))}-{digest}.npy"
-        features = read_cached(path)
-        if features is None:
-            features = np.asarray(compute(grey), np.float16)
-            write_cached(path, features)
+        features = cached(path, lambda: np.asarray(compute(grey), np.float16))
         return features.astype(np.float32)
 
-    encoder.function = cached
+    encoder.function = read
 
 
 def encoder_key(encoder: Encoder) -> str:
@@ -87,23 +81,20 @@ def encoder_key(encoder: Encoder) -> str:
     return hashlib.blake2b(made, digest_size=8).hexdigest()
 
 
-def read_cached(path: Path) -> NDArray[Any] | None:
-    """Read an array; None if it is missing or damaged."""
-    try:
-        return np.load(path)
-    except (OSError, ValueError, EOFError):
-        return None
-
-
-def write_cached(path: Path, values: NDArray[Any]) -> None:
-    """Write an array, unless the disk is full.
+def cached(path: Path, compute: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+    """Read an array. If it is missing or damaged, compute it, and write it unless the disk is full.
 
     It is not synced, because what a power failure loses is computed again.
     """
+    with contextlib.suppress(OSError, ValueError, EOFError):
+        return np.load(path)
+    values = compute()
     temporary = path.with_name(f".{uuid.uuid4().hex[:8]}.npy")
     with contextlib.suppress(OSError):  # usually a full disk
+        path.parent.mkdir(parents=True, exist_ok=True)
         try:
             np.save(temporary, values)
             os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
+    return values

@@ -44,16 +44,15 @@ class TrainingHooks:
         return []
 
     def cost(self, output: HeadOutput, rows: Rows, tau_px: float) -> Tensor | None:
-        """Compute the loss of the parts of `replayed`; `tau_px` is the soft clamp of new rows."""
+        """Compute a loss of the rows of `replayed`, or of the weights.
+
+        `tau_px` is the soft clamp of new rows.
+        """
         return None
 
     def constraints(self, output: HeadOutput, rows: Rows) -> list[Tensor]:
         """Return losses whose gradients `edit_step` needs; they are not minimised."""
         return []
-
-    def regularizer(self) -> Tensor | None:
-        """Compute a loss of the weights."""
-        return None
 
     def edit_step(self, proposed: ProposedStep) -> None:
         """Edit a step after the optimisers, so that constraints hold for the applied step."""

@@ -159,12 +159,9 @@ class HeadTrainer:
         replayed = output.part(slice(fresh, None))
         remembered = rows.part(slice(fresh, None))
         loss = costs.mean()
-        terms = [self.hooks.regularizer()]
-        if replays:
-            terms.append(self.hooks.cost(replayed, remembered, tau_px))
-        for term in terms:
-            if term is not None:
-                loss = loss + term
+        protection = self.hooks.cost(replayed, remembered, tau_px)
+        if protection is not None:
+            loss = loss + protection
         losses = self.hooks.constraints(replayed, remembered)
         constraints = list(map(self._gradients, losses))
         loss.backward()
@@ -191,7 +188,7 @@ class HeadTrainer:
     ) -> tuple[Tensor, Tensor]:
         options = self.options
         costs, errors = reprojection_loss(points, rows.target, tau_px, options.loss)
-        if rows.known is not None:
+        if options.surface_weight > 0:
             surface = surface_loss(points, rows.known, rows.target, tau_px)
             costs = costs + options.surface_weight * surface
         return costs, errors
