@@ -384,6 +384,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "network-checks: memory": network_tables.memory,
     "network-checks: real rooms": network_tables.summary("networks-real"),
     "network-trials: ideas": network_tables.summary("networks-ideas", single=True),
+    "network-trials: beyond": network_tables.summary("networks-beyond", single=True),
     "network-trials: units of positions": _rows(
         "room,frames,side,metre,axes,reach,deviation", "sars-units"
     ),

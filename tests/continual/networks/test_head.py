@@ -178,7 +178,7 @@ def test_new_centres_of_a_shared_softmax_hardly_move_old_points() -> None:
         before = head(features, 0, descriptors).points
         head.grow(20 * normal(100, 3, seed=3), seed=3)
         after = head(features, 0, descriptors).points
-    assert (after - before).norm(dim=-1).max() < 0.005
+    assert (after - before).norm(dim=-1).max() < 0.02
     assert len(head.centres) == CENTRES + 100
 
 
