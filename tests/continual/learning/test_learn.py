@@ -121,13 +121,13 @@ def test_memory_in_bytes_is_respected_and_used(
     assert sizes[0] < sizes[1] < sizes[2] == 30
 
 
-@pytest.mark.parametrize("name", ["sars_pixels", "isolation"])
 def test_whitening_is_fitted_to_the_first_scene_only(
-    name: str, first_stages: Stages, rooms: Rooms, quick: StageOptions
+    first_stages: Stages, rooms: Rooms, quick: StageOptions
 ) -> None:
-    before = first_stages[name].heads[0]
+    first = first_stages["sars_pixels"]
+    before = first.heads[0]
     assert not torch.equal(before.feature_map, torch.eye(before.features))
-    after = second_stage(first_stages[name], rooms, quick).heads[-1]
+    after = second_stage(first, rooms, quick).heads[-1]
     assert torch.equal(after.feature_map, before.feature_map)
     assert torch.equal(after.feature_mean, before.feature_mean)
 

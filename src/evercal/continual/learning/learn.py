@@ -57,7 +57,7 @@ def learn(
     atlas = after.atlas(options.grid_scenes)
     cell, buffer = _begun(rows, atlas, recording, method.head_per_scene)
     head = after.heads[-1]
-    if not teacher:
+    if head.scenes == 1:
         _whiten(head, [buffer], options.seed)
     memories = []
     if method.replays:
@@ -142,18 +142,16 @@ def _begun(
 
 
 def _head_to_grow(scenes: LearnedScenes, separate: bool, options: StageOptions) -> Head:
-    """A new head, the last one, or with `separate` a copy of its weights without scenes."""
-    if not scenes.heads:
-        head = fresh_head(
-            features=scenes.encoder.width,
-            descriptor=scenes.descriptor.width,
-            options=options.head,
-            seed=options.seed,
-        )
-        return head.to(scenes.device)
-    if separate:
-        return scenes.heads[-1].without_scenes()
-    return scenes.heads.pop()
+    """The head of the earlier scenes; a new one for the first scene, and with `separate`."""
+    if scenes.heads and not separate:
+        return scenes.heads.pop()
+    head = fresh_head(
+        features=scenes.encoder.width,
+        descriptor=scenes.descriptor.width,
+        options=options.head,
+        seed=options.seed,
+    )
+    return head.to(scenes.device)
 
 
 def _new_centres(head: Head, options: StageOptions, positions_m: Array) -> Tensor:

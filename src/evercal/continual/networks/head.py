@@ -21,7 +21,6 @@ from torch.nn import functional as F
 
 from evercal.classes import frozen
 from evercal.errors import InputError, require_numbers
-from evercal.typing import Strings
 
 SCALE_MAX = 4.0
 """GLACE's s_max: the reciprocal of the smallest homogeneous coordinate (no unit)."""
@@ -31,8 +30,8 @@ WHITENING = 0.5
 """Strength of the input whitening, from 0 (none) to 1 (fully decorrelated)."""
 NEW_LOGIT = -10.0
 """Logit of a centre that joins the softmax of earlier scenes, before it is trained."""
-PER_CENTRE = ("logit", "logit_bias", "offset", "offset_bias")
-"""Parameters with a row for each centre; with shared offsets only the first two."""
+OWNED = ("code", "logit", "logit_bias", "offset", "offset_bias")
+"""Parameters whose number of rows depends on the scenes."""
 
 
 @frozen
@@ -138,8 +137,7 @@ class Head(nn.Module):
         """Build a head from a `state_dict()` in half or single precision."""
         head = fresh_head(features, descriptor, options, seed=0)
         head.to(state["code"].device)
-        # The shapes of these depend on the number of scenes, so they are taken from the state.
-        for name in ("code", *PER_CENTRE):
+        for name in OWNED:
             setattr(head, name, nn.Parameter(state[name].float().clone()))
         head.centres = state["centres"].clone()
         head.centre_scene = state["centre_scene"].clone()
@@ -147,22 +145,6 @@ class Head(nn.Module):
         counts = torch.bincount(head.centre_scene, minlength=head.scenes)
         head._owned = [0, *counts.cumsum(0).tolist()]
         return head
-
-    def without_scenes(self) -> "Head":
-        """Copy the weights that scenes share, and centres that belong to no scene."""
-        state = dict(self.state_dict())
-        state["code"] = state["code"][:0]
-        if self.options.centres == "grow":
-            for name in ("centres", "centre_scene", *self.owned_by_centres):
-                state[name] = state[name][:0]
-        return Head.from_state(self.features, self.descriptor, self.options, state)
-
-    @property
-    def owned_by_centres(self) -> Strings:
-        """Names of the parameters that have a row for each centre."""
-        if self.options.offsets == "per_centre":
-            return PER_CENTRE
-        return PER_CENTRE[:2]
 
     @property
     def features(self) -> int:
