@@ -4,6 +4,7 @@ import hashlib
 import inspect
 from collections.abc import Iterator
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 from pickle import UnpicklingError
 from time import monotonic
@@ -11,7 +12,6 @@ from typing import Any
 
 import torch
 
-from evercal import __version__
 from evercal.continual.methods.method import Method
 from evercal.continual.networks.trainer import HeadTrainer, Progress
 from evercal.storage.atomic import replacing, write_bytes
@@ -77,7 +77,13 @@ def _resumed(trainer: HeadTrainer, key: str, checkpoint: Path) -> list[Any]:
 
 def _key(trainer: HeadTrainer, method: Method) -> str:
     """Digest of what decides a training: options, code of the method, first weights and rows."""
-    decides = [__version__, torch.__version__, trainer.options, trainer.seed, method]
+    decides = [
+        version("evercal"),
+        torch.__version__,
+        trainer.options,
+        trainer.seed,
+        method,
+    ]
     with suppress(OSError, TypeError):  # of a method that was typed in
         decides.append(inspect.getsource(type(method)))
     key = hashlib.blake2b(repr(decides).encode(), digest_size=16)
