@@ -35,7 +35,7 @@ class NetworkOptions(Training):
     """Options of strategies that train a network; a map refuses them."""
 
     weight: Annotated[float | None, args.shown("W")] = None
-    """Weight of what protects earlier scenes: the strategy's weight, scale of SPDD, alpha of GEC or
+    """Weight of what protects earlier scenes: that of the replayed rows, alpha of GEC or
     strength of EWC. Default: that of the strategy."""
     seed: int = 0
     """Random seed."""
