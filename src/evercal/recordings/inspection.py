@@ -216,8 +216,15 @@ def _camera_warnings(camera: Camera) -> Iterator[str]:
         yield f"{name}: principal point {point} is far from the middle; {size}"
     if not 20 < view < 150:
         yield f"{name}: sees {view:.0f} deg across; {size}"
-    if not 0.8 < camera.fx / camera.fy < 1.25:
-        yield f"{name}: fx {camera.fx:.0f} and fy {camera.fy:.0f} differ; square pixels?"
+    ratio = camera.fx / camera.fy
+    if not 0.9 < ratio < 1.1:
+        focal = max(camera.fx, camera.fy)
+        aspect = camera.width / camera.height
+        yield (
+            f"{name}: fx {camera.fx:.0f} and fy {camera.fy:.0f} are of images squeezed from"
+            f" {aspect / ratio:.2f}:1 to {aspect:.2f}:1; if yours were cut out instead, both are"
+            f" {focal:.0f}"
+        )
 
 
 def _motion_warnings(

@@ -5,7 +5,7 @@ are used. Pixel (0, 0) is the centre of the top-left pixel, and images are uprig
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,56 +13,80 @@ import numpy as np
 
 from evercal.geometry import Camera
 from evercal.geometry.camera import COEFFICIENT_COUNTS, COEFFICIENTS
+from evercal.recordings.cameras.camera_notations import EXPECTED
+from evercal.recordings.cameras.field_of_view import (
+    VIEW_NAMES,
+    has_view,
+    pixels_of_view,
+)
 from evercal.recordings.cameras.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.poses.row_files import by_alias, is_number
 from evercal.storage.text_files import few
 from evercal.typing import Array, Floats, JsonObject, Record, Size
 
 _NAMES = by_alias("""
-camera_matrix: cameramatrix intrinsicmatrix mtx k
+camera_matrix: cameramatrix intrinsicmatrix mtx k camk cammtx cammatrix camerak
 camera_matrix: cameraintrinsics intrinsics intrinsic
 camera_matrix: projectionparameters
 distortion_coefficients: distortioncoefficients distortioncoeffs
 distortion_coefficients: distortionparameters distortionparams
 distortion_coefficients: distcoeffs distcoeff distortion dist
+distortion_coefficients: distcoefs distortioncoefs disto distortions distortioncoeff
+distortion_coefficients: cameradistortion lensdistortion cameradist cameradistcoeffs
+distortion_coefficients: camdist lenscoeffs lensdistortioncoefficients
 distortion_coefficients: coefficients coeffs d kc
-image_width: imagewidth width w
-image_height: imageheight height h
-image_size: imagesize imgsize resolution size
-fx: fx
-fy: fy
-cx: cx ppx
-cy: cy ppy
+image_width: imagewidth width w resolutionwidth resolutionx
+image_height: imageheight height h resolutionheight resolutiony
+image_size: imagesize imgsize resolution size imagersize imageresolution
+fx: fx focallengthx focalx
+fy: fy focallengthy focaly
+cx: cx ppx principalpointx principalptx
+cy: cy ppy principalpointy principalpty
+k1: k1 radialdistortion1
+k2: k2 radialdistortion2
+k3: k3 radialdistortion3
+k4: k4 radialdistortion4
+p1: p1 tangentialdistortion1 tangentialdistortioncoefficientx
+p2: p2 tangentialdistortion2 tangentialdistortioncoefficienty
 """)
 """Names of fields by their aliases."""
 _MODELS = {"": "brown"} | by_alias("""
-brown: plumbbob rationalpolynomial
+brown: brown plumbbob rationalpolynomial
 brown: brownconrady radtan radialtangential
-brown: opencv fullopencv
-brown: pinhole perspective rectified
+brown: opencv fullopencv opencv4 opencv5 opencv8 opencv12
+brown: pinhole perspective rectified 0
+brown: simplepinhole simpleradial radial
+brown: pinholeradialtangential pinholeradtan8
 none: none null
-fisheye: fisheye opencvfisheye
+fisheye: fisheye opencvfisheye simplefisheye
+fisheye: radialfisheye simpleradialfisheye
 fisheye: equidistant equi
-fisheye: kannalabrandt kannalabrandt4 kannalabrandt8
+fisheye: kannalabrandt kannalabrandt4 kannalabrandt8 kb4 1
 fov: fov atan
 omni: omni
-eucm: eucm
+ucm: ucm
+eucm: eucm extendedunified
 ds: ds doublesphere
+division: divisionundistortion
 """)
 """Kinds of distortion by names of models, without spaces, dashes and underscores."""
-_MODEL_NAMES = (
+MODEL_NAMES = (
     "distortionmodel",
     "model",
     "cameramodel",
+    "cameratype",
+    "intrinsictype",
+    "lensmodel",
     "modeltype",
     "projectionmodel",
+    "type",
 )
 """Names of fields that hold the name of a model."""
 _PINHOLE = COEFFICIENTS["pinhole"]
 DISTORTION = ("distortion_coefficients", *_PINHOLE)
 """Names of fields that hold distortion."""
-_UNIQUE = {*_NAMES.values(), *_PINHOLE}
-"""Record that may be stated once."""
+FIELDS = {*_NAMES.values(), *_PINHOLE}
+"""Names of fields of a camera; each may be stated once."""
 _CAMERA_INFO = {
     "rectificationmatrix",
     "projectionmatrix",
@@ -70,31 +94,51 @@ _CAMERA_INFO = {
     "roi",
 }
 """Names of fields of ROS."""
+_OF_ROS = {"rectificationmatrix", "header"}
+"""Names of fields that only ROS writes."""
 _RECTIFIED = {"p", "r"}
 """Names of the matrices of ROS for rectified images."""
 _KNOWN = {
-    *_NAMES.values(),
-    *DISTORTION,
-    *_MODEL_NAMES,
+    *FIELDS,
+    *MODEL_NAMES,
     *_CAMERA_INFO,
     "binningx",
     "binningy",
     "fisheyemodel",
 }
 """Names of fields that are used, or that may be left out."""
+_CENTRAL = 0.05
+"""Largest distance of a usual principal point from the middle, widths and heights."""
 _HARMLESS = re.compile(
     r"error|rms|repro|resid|std|dev|sigma|covar|uncert|fps|rate|freq|square|board|marker|pattern"
-    r"|chess|tag|count|num|frames|images|views|points|flags|date|time|stamp|version|serial|index"
-    r"|id$|baseline|depth|range|temp|apert|expos|gain|fov|angle|focal|aspect|mm$|rotation|trans"
-    r"|^[rt]vec|quat|extrin|pose|position|orient|imu|noise|rgb|track|^bf$|^new|imagescale|overlaps"
-    r"|^d[wh]$|^cameratype$|perframe"
+    r"|chess|tag|count|num|nr|frames|images|views|points|flags|date|time|stamp|version|serial|id$"
+    r"|index|baseline|depth|range|temp|apert(?!ureoffset)|expos|gain|fov|angle|focal|aspect|mm$|rotation|trans"
+    r"|^[rt]vec|quat|extrin|pose|position|orient|imu|noise|^rgb$|track|^bf$|^new|imagescale"
+    r"|overlap|^d[wh]$|perframe|center|radius|score|neighbor|^t\d|region|icam|stereo|thdepth"
+    r"|orbextract|viewer|system|accel|gyro|bias|walk|mocap|vignette|batch|unit|housing|rect|corner"
+    r"|^t$|^pos|^rot|euler|axes|axis|focus|fstop|near|far|clip|socket|firmware|port|seed|quality|channels|bits|buffer|cost"
+    r"|weight|speed|robot|joint|gripper|world|origin|name|^step|^bounds|limit|threshold|light|ambient|bright|white"
 )
 """Names of numbers that do not change where a point lies in the image."""
-EXPECTED = (
-    "give a 3x3 matrix as text, JSON, YAML or NPZ with camera_matrix and dist_coeffs, a ROS"
-    " camera_info or OpenCV's storage"
+_PROJECTION = re.compile(r"(.*\.)?(p\d*|prect\d*|proj.*)$")
+"""Names of projection matrices, which are for rectified images."""
+_LENS = re.compile(
+    r"disto|^dist(?!an)|coef|radial|tangent|^lens(?!pos|name|id|serial)|lenses|warp|aberr"
 )
-"""What a camera file may hold, for messages."""
+"""Names of numbers that do, whatever else the name says."""
+
+
+def is_harmless(key: str) -> bool:
+    """Whether a number of this name, or in this block, changes no pixel."""
+    parts = [_plain(part) for part in key.split(".")]
+    if any(map(_LENS.search, parts)):
+        return False
+    return any(part in _CAMERA_INFO or _HARMLESS.search(part) for part in parts)
+
+
+def is_array(value: object) -> bool:
+    """Whether a value holds numbers in rows: lists, or an array of OpenCV or ROS."""
+    return isinstance(value, list) or (isinstance(value, dict) and "data" in value)
 
 
 def field_name(key: object) -> str:
@@ -107,13 +151,21 @@ def named_fields(data: Record) -> JsonObject:
     """Values by `field_name`; ValueError if two keys are the same field."""
     keys = {}
     fields = {}
-    for key in data:
+    for key, value in data.items():
         name = field_name(key)
-        if name in keys and name in _UNIQUE:
+        if name == "distortion_coefficients" and _is_word(value):
+            name = "distortionmodel"  # as RealSense prints it
+        elif name in _PINHOLE and is_array(value):
+            continue  # P1 and P2 of a stereo camera
+        if name in keys and name in FIELDS:
             raise ValueError(f"{keys[name]} and {key} are the same; keep one of them")
         keys[name] = key
-        fields[name] = data[key]
+        fields[name] = value
     return fields
+
+
+def _is_word(value: object) -> bool:
+    return isinstance(value, str) and value.lower() not in ("none", "null", "")
 
 
 def camera_of(data: Record, size: Size | None) -> Camera:
@@ -123,20 +175,32 @@ def camera_of(data: Record, size: Size | None) -> Camera:
     no camera, or the images are cut out or distorted otherwise.
     """
     fields = named_fields(data)
-    roi = data.get("roi")
-    if isinstance(roi, dict) and (roi.get("x_offset") or roi.get("y_offset")):
-        raise ValueError(
-            f"the image is a cut-out (roi {roi}); give the whole image's camera_info"
-        )
+    for key, value in data.items():
+        if key.startswith("roi.") and key.endswith("offset") and value:
+            raise ValueError(
+                f"the image is a cut-out ({key} {value}); give the whole image's camera_info"
+            )
+    plain = {*map(_plain, data)}
+    is_ros = bool(plain & _OF_ROS) or plain >= _RECTIFIED
+    if "lensmodel" in fields:  # of mrcal
+        numbers = numbers_of(fields.get("camera_matrix"), "intrinsics")
+        fields["camera_matrix"] = numbers[:4]
+        fields["distortion_coefficients"] = numbers[4:]
+    used: Collection[str] = ()
+    if "camera_matrix" not in fields and "fx" not in fields and has_view(fields):
+        fields = pixels_of_view(fields, _size(fields, data, size))
+        used = VIEW_NAMES
     models: JsonObject = {}
-    for name in _MODEL_NAMES:
-        if name in fields:
-            models[_model_kind(fields[name])] = fields[name]
+    for name in MODEL_NAMES:
+        word = fields.get(name)
+        kind = _model_kind(word)
+        # Numbers are models in files of DepthAI only, and a type may be that of other things.
+        other = isinstance(word, int | float) and "lensposition" not in fields
+        if name in fields and not other and (kind or name != "type"):
+            models[kind] = word
     for kind in models:
         if kind in RADIAL_MODELS:
             return _of_radial_model(kind, fields, _size(fields, data, size))
-    plain = {*map(_plain, data)}
-    is_ros = bool(plain & (_CAMERA_INFO | _RECTIFIED))
     model = "pinhole"
     if "fisheye" in models or fields.get("fisheyemodel"):
         model = "fisheye"
@@ -152,19 +216,18 @@ def camera_of(data: Record, size: Size | None) -> Camera:
     _refuse_other_models(models, distortion)
     matrix = _matrix(fields, data)
     width, height = _size(fields, data, None if is_ros else size)
-    _refuse_unknown(data)
+    _refuse_unknown({key: data[key] for key in data if field_name(key) not in used})
     camera = Camera.from_matrix(matrix, width, height)
     camera = replace(camera, distortion=distortion, model=model)
     if size != camera.size:
         camera = _binned(camera, fields)
-    _refuse_misfit(camera)
     return camera
 
 
 def _model_kind(model: object) -> str:
     """A value of `_MODELS`; `zero` for models that are read without distortion only, else empty."""
     _, _, name = str(model).rpartition(".")
-    plain = re.sub(r"[\s_-]", "", name.lower())
+    plain = re.sub(r"[\s_-]", "", name.lower()).removeprefix("lensmodel")
     kind = _MODELS.get(plain, "")
     if not kind and "conrady" in plain:
         # RealSense prints distortion.inverse_brown_conrady, mostly with zeros.
@@ -174,13 +237,18 @@ def _model_kind(model: object) -> str:
 
 def _of_radial_model(kind: str, fields: Record, size: tuple[Any, Any]) -> Camera:
     """As Kalibr states it: parameters before the focal lengths, or the one of `fov` after them."""
-    numbers = numbers_of(fields.get("camera_matrix"), "intrinsics")
-    name = "distortion_coefficients"
-    distortion = numbers_of(fields.get(name, []), name)
-    if kind == "fov":
+    names = (*RADIAL_MODELS[kind], "fx", "fy", "cx", "cy")
+    if "fx" in fields:
+        numbers = numbers_of([fields.get(name) for name in names], ", ".join(names))
+    else:
+        numbers = numbers_of(fields.get("camera_matrix"), "intrinsics")
+    distortion = []
+    for name in DISTORTION:
+        if fields.get(name):
+            distortion += numbers_of([fields[name]], name)
+    if kind == "fov" and "fx" not in fields:
         numbers = [*distortion, *numbers]
         distortion = []
-    names = (*RADIAL_MODELS[kind], "fx", "fy", "cx", "cy")
     if len(numbers) != len(names) or any(distortion):
         expected = f"a camera of model {kind} has {', '.join(names)}"
         raise ValueError(
@@ -188,8 +256,9 @@ def _of_radial_model(kind: str, fields: Record, size: tuple[Any, Any]) -> Camera
             f" images or calibrate an equidistant model"
         )
     *parameters, fx, fy, cx, cy = numbers
-    width, height = map(int, size)
-    return nearest_fisheye(kind, parameters, (width, height), (fx, fy), (cx, cy))
+    if kind == "division":  # stated for pixels
+        parameters = [parameters[0] * fx * fx]
+    return nearest_fisheye(kind, parameters, size, (fx, fy), (cx, cy))
 
 
 def _distortion(fields: Record, model: str) -> Floats | None:
@@ -289,7 +358,7 @@ def _size(fields: Record, data: Record, size: Size | None) -> tuple[Any, Any]:
 def _refuse_unknown(data: Record) -> None:
     """Refuse numbers that may change where a point lies in the image."""
     for key, value in data.items():
-        if field_name(key) in _KNOWN or _HARMLESS.search(_plain(key)):
+        if field_name(key) in _KNOWN or is_harmless(key):
             continue
         if isinstance(value, Mapping):
             value = value.get("data")
@@ -302,11 +371,13 @@ def _refuse_unknown(data: Record) -> None:
             )
 
 
-def _is_matrix(key: object, value: object, count: int) -> bool:
+def _is_matrix(key: str, value: object, count: int) -> bool:
     """Whether numbers are a 3x3 or 4x4 matrix, or P of ROS, or another one in rows."""
+    if is_array(value) and _LENS.search(_plain(key)):
+        return False
     if count in (9, 16):
         return True
-    if count == 12 and _plain(key) == "p":
+    if count == 12 and _PROJECTION.match(_plain(key)):
         return True
     if not isinstance(value, list) or len(value) < 3:
         return False
@@ -322,7 +393,19 @@ def _binned(camera: Camera, fields: Record) -> Camera:
     return camera.resized(width, height)
 
 
-def _refuse_misfit(camera: Camera) -> None:
+def states_size(data: Record) -> bool:
+    """Whether fields state the size of the images."""
+    return not {"image_width", "image_size"}.isdisjoint(map(field_name, data))
+
+
+def is_central(camera: Camera) -> bool:
+    """Whether the principal point is near the middle of the image."""
+    right = (camera.cx + 0.5) / camera.width
+    down = (camera.cy + 0.5) / camera.height
+    return max(abs(right - 0.5), abs(down - 0.5)) < _CENTRAL
+
+
+def refuse_misfit(camera: Camera) -> None:
     """Refuse short focal lengths, and principal points outside of the image."""
     focal = min(camera.fx, camera.fy)
     plausible = focal >= camera.width / 10
@@ -342,7 +425,7 @@ def _keys(data: Record) -> str:
 
 
 def _plain(key: object) -> str:
-    return str(key).lower().replace("_", "")
+    return re.sub(r"[\s_-]", "", str(key).lower())
 
 
 def numbers_of(value: Any, name: str, count: int | None = None) -> list[float]:

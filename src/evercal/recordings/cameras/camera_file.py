@@ -5,36 +5,48 @@ messages are read. A camera may stand inside other entries, such as `cam0` of a 
 """
 
 import re
-from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
+from evercal.recordings.cameras.camera_blocks import cameras_of
 from evercal.recordings.cameras.camera_fields import (
-    DISTORTION,
-    EXPECTED,
     camera_of,
-    field_name,
-    named_fields,
+    is_central,
+    refuse_misfit,
+    states_size,
 )
+from evercal.recordings.cameras.camera_notations import entries_of
 from evercal.recordings.poses.array_files import arrays_as_lists
 from evercal.recordings.poses.row_files import is_number
-from evercal.storage.text_files import documents, few, named_errors, naming, read_text
-from evercal.typing import JsonObject, PathLike, Record, Size
+from evercal.storage.text_files import few, named_errors, naming, read_text
+from evercal.typing import PathLike, Record, Size
 
-_OF_ONE_CAMERA = ("camera_matrix", "fx", "fy", "cx", "cy")
-"""Record that do not hold for the cameras inside an entry."""
+_UNREADABLE = {
+    "ModelParameters": "raw calibration of an Azure Kinect, for the whole sensor; write fx, fy, cx,"
+    " cy, k1 to k6, p1 and p2 of the mode of the images, as k4a's calibration tool prints them",
+    "ParGroup": "camera parameters of HALCON; change the images to no distortion and write the"
+    " matrix of cam_par_to_cam_mat",
+}
+"""Words of formats that are not read, and what to do."""
 
 
 def read_camera(path: PathLike, size: Size | None = None) -> Camera:
     """Read the intrinsics of one camera.
 
-    `size` is (width, height) of the images in pixels, for files without one.
+    `FILE:NAME` chooses one of several cameras in a file. `size` is (width, height) of the images
+    in pixels, for files without one.
     """
     path = Path(path)
+    name = ""
+    if not path.exists():
+        file, colon, word = str(path).rpartition(":")
+        if colon and Path(file).is_file():
+            path = Path(file)
+            name = word
     with named_errors(path, "camera file"):
-        return camera_from_fields(fields_of(path, size), size)
+        return camera_from_fields(fields_of(path, size), size, name)
 
 
 def read_camera_of_size(path: Path, size: Size, images: str) -> Camera:
@@ -48,90 +60,58 @@ def check_size(source: str, camera: Camera, size: Size, images: str) -> None:
     """Raise `InputError` if a camera from `source` has another size than its images."""
     width, height = size
     if camera.width != width or camera.height != height:
+        resized = f"squeezed or cut out from {camera.width}x{camera.height}"
+        if abs(width * camera.height - height * camera.width) <= max(camera.size):
+            own = camera.resized(width, height)
+            resized = f"resized, with fx {own.fx:.1f}, cx {own.cx:.1f}, cy {own.cy:.1f}"
         raise InputError(
             f"{source}: is for images of {camera.width}x{camera.height}, {images} is"
-            f" {width}x{height}; give the intrinsics of this image size with `camera`"
+            f" {width}x{height} ({resized}?); give the intrinsics of this image size with `camera`"
         )
 
 
-def camera_from_fields(data: Record, size: Size | None = None) -> Camera:
+def camera_from_fields(
+    data: Record, size: Size | None = None, name: str = ""
+) -> Camera:
     """Build a camera from the fields of a file, or of a ROS message.
 
-    The camera may stand inside other fields. Of several, the only one of the images' size is taken.
-    `size` is (width, height) in pixels of the images, if the fields may lack it. ValueError: the
-    fields are no camera or several, or the images are distorted otherwise or cut out.
+    The camera may stand inside other fields. Of several, the one with `name` in the names of its
+    blocks is taken, or the only one of the images' size. `size` is (width, height) in pixels of the
+    images, if the fields may lack it. ValueError: the fields are no camera or several, or the
+    images are distorted otherwise or cut out.
     """
-    others = ("lenses", "for_stated_lens")  # of a calibration, beside its camera
-    data = {key: value for key, value in data.items() if key not in others}
-    entries = [*_entries(_undotted(data), {}, "")]
+    entries = cameras_of(data)
     if not entries:
         return camera_of(data, size)
+    places = [*entries]
+    if name:
+        exact = [place for place in places if place == name]
+        within = [place for place in places if name.lower() in place.lower()]
+        places = exact or within
+        if not places:
+            raise ValueError(f"no camera {name!r}, only {few([*entries], most=8)}")
     cameras: dict[str, Camera] = {}
-    for name, entry in entries:
-        if name:
-            with naming(name):
-                cameras[name] = camera_of(entry, size)
-        else:
-            cameras["outside of these"] = camera_of(entry, size)
-    fitting = {camera for camera in cameras.values() if camera.size == size}
-    choice = fitting or {*cameras.values()}
+    fitting: dict[Camera, str] = {}
+    for place in places:
+        entry = entries[place]
+        with naming(place) if place else nullcontext():
+            camera = camera_of(entry, size)
+        cameras[place or "outside of these"] = camera
+        if camera.size == size and (states_size(entry) or is_central(camera)):
+            fitting[camera] = place
+    choice = fitting or {camera: place for place, camera in cameras.items()}
+    first = next(iter(choice))
     if len(choice) == 1:
-        return choice.pop()
+        refuse_misfit(first)
+        return first
     descriptions = []
-    for name, camera in cameras.items():
+    for place, camera in cameras.items():
         pixels = f"{camera.width}x{camera.height}"
-        descriptions.append(f"{name} ({pixels}, fx {camera.fx:.1f})")
+        descriptions.append(f"{place} ({pixels}, fx {camera.fx:.1f})")
     raise ValueError(
-        f"holds several cameras: {few(descriptions)}; give a file of the right one"
+        f"holds {len(cameras)} cameras: {few(descriptions, most=8)}; append a part of one name to"
+        f" `camera`, such as FILE:{choice[first].split()[0]}"
     )
-
-
-def _undotted(data: Record) -> JsonObject:
-    """ORB-SLAM's `Camera1.fx` as an entry `Camera1`; `Camera.fps` holds for all cameras."""
-    groups: dict[str, JsonObject] = {"": {}, "Camera": {}}
-    for key, value in data.items():
-        group, _, name = str(key).rpartition(".")
-        if key == "Camera.type":
-            name = "camera_model"
-        groups.setdefault(group, {})[name] = value
-    plain = groups.pop("")
-    for_all = groups.pop("Camera")
-    return {**plain, **for_all, **groups}
-
-
-def _entries(data: Record, around: Record, name: str) -> Iterator[tuple[str, Record]]:
-    """Record of all cameras in nested entries, by name, with numbers that stand around them."""
-    data = _ungrouped(data)
-    fields = named_fields(data)
-    hidden = set(fields)
-    if not hidden.isdisjoint(DISTORTION):
-        hidden.update(DISTORTION)
-    inherited = {key: value for key, value in around.items() if key not in hidden}
-    matrix = fields.get("camera_matrix")
-    if "fx" in fields or isinstance(matrix, list | dict):
-        yield name, {**inherited, **data}
-    for key, value in fields.items():
-        if key not in _OF_ONE_CAMERA:
-            inherited[key] = value
-    for key, value in data.items():
-        inner = f"{name}.{key}".lstrip(".")
-        parts = {inner: value}
-        if isinstance(value, list):
-            parts = {f"{inner}[{i}]": entry for i, entry in enumerate(value)}
-        for part, entry in parts.items():
-            if isinstance(entry, dict):
-                yield from _entries(entry, inherited, part)
-
-
-def _ungrouped(data: Record) -> JsonObject:
-    """Record such as `intrinsics: {fx: ...}` without that group."""
-    fields = dict(data)
-    for key, value in data.items():
-        group = field_name(key) in ("camera_matrix", "distortion_coefficients")
-        if group and isinstance(value, dict) and "data" not in value:
-            for inner, number in fields.pop(key).items():
-                fields.setdefault(inner, number)
-    return fields
 
 
 def fields_of(path: Path, size: Size | None = None) -> Record:
@@ -140,9 +120,14 @@ def fields_of(path: Path, size: Size | None = None) -> Record:
     A focal length alone has its principal point in the middle of images of `size`.
     """
     with path.open("rb") as file:
-        zipped = file.read(2) == b"PK"
-    if zipped:
+        start = file.read(6)
+    if start[:2] == b"PK":
         return arrays_as_lists(path)
+    if start == b"MATLAB":
+        raise ValueError(
+            "MATLAB's pixels start at (1, 1); write fx, fy, cx - 1, cy - 1 and the distortion as"
+            " JSON"
+        )
     text = read_text(path, "camera file")
     words = re.sub(r"#.*|[,;\[\]]", " ", text).split()
     if all(map(is_number, words)):
@@ -150,17 +135,10 @@ def fields_of(path: Path, size: Size | None = None) -> Record:
         if len(numbers) == 1 and size:
             numbers = centred_camera(numbers[0], size).matrix().ravel().tolist()
         return {"camera_matrix": numbers}
-    try:
-        if "<opencv_storage" in text:
-            return _of_xml(text)
-        is_json = text.lstrip().startswith("{")
-        # A printed message ends with '---', which opens a second, empty document.
-        data, *_ = [*documents(text, is_json), None]
-    except ValueError as error:
-        raise ValueError(f"{error}; {EXPECTED}") from None
-    if not isinstance(data, dict):
-        raise ValueError(f"no camera in it; {EXPECTED}")
-    return data
+    for mark, problem in _UNREADABLE.items():
+        if mark in text:
+            raise ValueError(problem)
+    return entries_of(text)
 
 
 def centred_camera(focal_px: float, size: Size) -> Camera:
@@ -168,34 +146,3 @@ def centred_camera(focal_px: float, size: Size) -> Camera:
     width, height = size
     centre = ((width - 1) / 2, (height - 1) / 2)
     return Camera(width, height, focal_px, focal_px, *centre)
-
-
-def _of_xml(text: str) -> JsonObject:
-    from xml.etree import ElementTree
-
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can expand without bound
-        raise ValueError("it declares XML entities")
-    try:
-        return _xml_value(ElementTree.fromstring(text))
-    except ElementTree.ParseError as error:
-        raise ValueError(f"not valid XML ({error})") from None
-
-
-def _xml_value(element: Any) -> Any:
-    """An array, a list, an object, or else a word or one or more numbers."""
-    data = element.find("data")
-    if data is not None:
-        return {"data": (data.text or "").split()}
-    if len(element):
-        values = [*map(_xml_value, element)]
-        tags = [child.tag for child in element]
-        if tags[0] == "_":
-            return values
-        return dict(zip(tags, values, strict=True))
-    words = (element.text or "").split()
-    if not words or not all(map(is_number, words)):
-        return " ".join(words)
-    numbers = [*map(float, words)]
-    if len(numbers) == 1:
-        return numbers[0]
-    return numbers

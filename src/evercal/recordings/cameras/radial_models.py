@@ -21,10 +21,12 @@ MAX_ERROR_PX = 0.5
 RADIAL_MODELS = {
     "fov": ("omega",),
     "omni": ("xi",),
+    "ucm": ("alpha",),
     "eucm": ("alpha", "beta"),
     "ds": ("xi", "alpha"),
+    "division": ("divundistdistortion",),
 }
-"""Parameters of the models by their names at Kalibr and COLMAP."""
+"""Parameters of the models by their names at Kalibr, COLMAP, Basalt and OpenICC."""
 
 
 def image_radius(name: str, angle: Array, parameters: Sequence[float]) -> Array:
@@ -33,6 +35,9 @@ def image_radius(name: str, angle: Array, parameters: Sequence[float]) -> Array:
         (omega,) = parameters
         tangent = 2 * np.tan(angle) * np.tan(omega / 2)
         return np.arctan(tangent) / omega
+    if name == "division":
+        ideal = np.tan(angle)
+        return 2 * ideal / (1 + np.sqrt(1 - 4 * parameters[0] * ideal**2))
     named = dict(zip(RADIAL_MODELS[name], parameters, strict=True))
     return _by_spheres(angle, **named)
 

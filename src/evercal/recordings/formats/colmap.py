@@ -16,8 +16,11 @@ import numpy as np
 from evercal.bounds import require_at_most
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
-from evercal.geometry.camera import COEFFICIENTS
-from evercal.recordings.cameras.radial_models import RADIAL_MODELS, nearest_fisheye
+from evercal.recordings.cameras.camera_fields import camera_of
+from evercal.recordings.cameras.colmap_models import (
+    COLMAP_PARAMETERS,
+    colmap_fields,
+)
 from evercal.recordings.formats.nerfstudio import frame_note
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import as_stored, files_in
@@ -27,34 +30,9 @@ from evercal.storage.text_files import (
     natural_key,
     path_inside,
 )
-from evercal.typing import Array, Size
 
 _MODEL_FOLDERS = (".", "sparse", "colmap/sparse", "distorted/sparse")
 """Usual places of models; distorted/sparse is before undistortion."""
-_PARAMETERS = {
-    "SIMPLE_PINHOLE": "fx cx cy",
-    "PINHOLE": "fx fy cx cy",
-    "SIMPLE_RADIAL": "fx cx cy k1",
-    "RADIAL": "fx cx cy k1 k2",
-    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
-    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
-    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-    "FOV": "fx fy cx cy omega",
-    "SIMPLE_RADIAL_FISHEYE": "fx cx cy k1",
-    "RADIAL_FISHEYE": "fx cx cy k1 k2",
-    "THIN_PRISM_FISHEYE": "",
-    "RAD_TAN_THIN_PRISM_FISHEYE": "",
-    "SIMPLE_DIVISION": "",
-    "DIVISION": "",
-    "SIMPLE_FISHEYE": "fx cx cy",
-    "FISHEYE": "fx fy cx cy",
-    "EUCM": "fx fy cx cy alpha beta",
-    "EQUIRECTANGULAR": "",
-}
-"""Parameters of the camera models by name, in the order of their numbers in binary files.
-
-Those that are not empty are OpenCV's, or those of `RADIAL_MODELS`. The others are not supported.
-"""
 _LAYOUTS = {
     "cameras": "CAMERA_ID MODEL WIDTH HEIGHT PARAMS",
     "images": "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME",
@@ -138,8 +116,8 @@ def _model(folder: Path) -> dict[str, tuple[Camera, SE3]]:
     file = folder / f"cameras{end}"
     with named_errors(file, "COLMAP model"):
         for key, model, width, height, *numbers in read(file):
-            size = (int(width), int(height))
-            cameras[int(key)] = _camera(model, size, np.array(numbers, float))
+            own = colmap_fields(model, int(width), int(height), [*map(float, numbers)])
+            cameras[int(key)] = camera_of(own, None)
     images = {}
     file = folder / f"images{end}"
     with named_errors(file, "COLMAP model"):
@@ -196,8 +174,8 @@ def _numbers(stream: BinaryIO, kinds: str) -> tuple[Any, ...]:
 
 def _stored_camera(stream: BinaryIO) -> Sequence[Any]:
     key, kind, *size = _numbers(stream, "IiQQ")
-    model = dict(enumerate(_PARAMETERS)).get(kind, f"{kind}")
-    count = len(_PARAMETERS.get(model, "").split())
+    model = dict(enumerate(COLMAP_PARAMETERS)).get(kind, f"{kind}")
+    count = len(COLMAP_PARAMETERS.get(model, "").split())
     return key, model, *size, *_numbers(stream, f"{count}d")
 
 
@@ -211,32 +189,6 @@ def _stored_image(stream: BinaryIO) -> Sequence[Any]:
     require_at_most(points, "numbers", "observations of an image")
     stream.seek(24 * points, 1)
     return *numbers, name.decode(errors="replace")
-
-
-def _camera(model: str, size: Size, numbers: Array) -> Camera:
-    names = _PARAMETERS.get(model, "").split()
-    if not names:
-        supported = [name for name, parameters in _PARAMETERS.items() if parameters]
-        raise ValueError(
-            f"camera model {model} is not supported, only {', '.join(supported)};"
-            f" undistort the images with 'colmap image_undistorter' and read its result"
-        )
-    if len(numbers) != len(names):
-        raise ValueError(f"{model} has the parameters {names}, got {len(numbers)}")
-    values = dict(zip(names, numbers.tolist(), strict=True))
-    fx = values["fx"]
-    focal = (fx, values.get("fy", fx))
-    # COLMAP counts from the image's corner.
-    centre = (values["cx"] - 0.5, values["cy"] - 0.5)
-    kind = model.lower()
-    if kind in RADIAL_MODELS:
-        parameters = [values[key] for key in RADIAL_MODELS[kind]]
-        return nearest_fisheye(kind, parameters, size, focal, centre)
-    lens = "fisheye" if kind.endswith("fisheye") else "pinhole"
-    count = 8 if "k6" in values else 4
-    names = COEFFICIENTS[lens][:count]
-    distortion = tuple(values.get(name, 0.0) for name in names)
-    return Camera(*size, *focal, *centre, distortion, lens)
 
 
 def _image_folder(root: Path, folder: Path, names: list[str]) -> Path:

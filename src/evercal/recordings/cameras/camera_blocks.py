@@ -1,0 +1,173 @@
+"""The cameras in nested entries, each with all numbers of the file that may be about it.
+
+A block is a camera if it states a focal length or an intrinsic matrix. Other values go to the
+cameras whose names hold all words of theirs: `rgbDistortion` to `rgbIntrinsic`, `LEFT_DISTO` to
+`LEFT_CAM_HD`, `D1` to `M1`, `lens` to all. Values that no camera takes keep the names that lead to
+them, such as `optics.a`, so that numbers of unknown meaning are refused by name.
+"""
+
+import re
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+from evercal.recordings.cameras.camera_fields import (
+    DISTORTION,
+    FIELDS,
+    MODEL_NAMES,
+    field_name,
+    is_array,
+    is_harmless,
+)
+from evercal.recordings.cameras.camera_notations import value_of
+from evercal.recordings.cameras.field_of_view import has_view
+from evercal.typing import JsonObject
+
+_WORD = re.compile(r"\[\d+\]|[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_NEUTRAL = frozenset(
+    re.findall(
+        r"\w+",
+        "camera cameras cam image images img lens matrix mat k d m data model type intrinsic"
+        " intrinsics parameter parameters params param calibration calib internal coefficient"
+        " coefficients coeffs coeff coefs coef distortion distortions dist disto radial tangential"
+        " resolution size info values value sensor optical stream frame projection main",
+    )
+)
+"""Words of names that do not tell cameras apart."""
+_SAME = {"color": "rgb", "colour": "rgb", "l": "left", "r": "right", "infrared": "ir"}
+"""Words that mean the same."""
+_OF_ARRAYS = ("camera_matrix", "distortion_coefficients", "image_size")
+"""Fields that are arrays beside a word such as `1` or `left`."""
+_OF_ONE_CAMERA = ("camera_matrix", "fx", "fy", "cx", "cy")
+"""Fields that hold for the camera of their block only."""
+_SHORT = {"m": "camera_matrix", "s": "image_size"}
+"""Fields by names that mean them only beside a word such as `1` or `left`."""
+
+
+class _Value(NamedTuple):
+    path: str
+    """Names that lead to it, with points between them."""
+    home: tuple[str, frozenset[str]]
+    """Block, and the words of its own name that tell cameras apart."""
+    field: str
+    words: frozenset[str]
+    """All words of the path that tell cameras apart."""
+    value: Any
+
+
+def cameras_of(data: object) -> dict[str, JsonObject]:
+    """Fields of all cameras by the names of their blocks."""
+    values = [_placed(path, value) for path, value in _leaves(data, "")]
+    homes: dict[Any, list[_Value]] = {}
+    for value in values:
+        homes.setdefault(value.home, []).append(value)
+    for is_camera in (_has_matrix, _has_view):
+        cameras = {home: own for home, own in homes.items() if is_camera(own)}
+        if cameras:
+            return dict(_fields(home, cameras, values) for home in cameras)
+    return {}
+
+
+def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Values of nested entries with the names that lead to them."""
+    if isinstance(value, str) and isinstance(value_of(value), list):
+        value = value_of(value)
+    parts: JsonObject = {}
+    if isinstance(value, dict) and not is_array(value):
+        for name, entry in value.items():
+            # Of our own files, which hold much else.
+            ours = str(value.get("format")).startswith("evercal")
+            if not ours or name in ("camera", "cameras"):
+                parts[f"{path}.{name}".lstrip(".")] = entry
+    elif isinstance(value, list):
+        sizes = field_name(path.rpartition(".")[2]) == "image_size"
+        for i, entry in enumerate(value):
+            name = i
+            if (
+                isinstance(entry, list)
+                and len(entry) == 2
+                and isinstance(entry[1], dict)
+            ):
+                name, entry = entry  # pairs, as a map of C++ in JSON
+            if isinstance(entry, dict):
+                name = entry.get("name") or entry.get("class") or name
+            if isinstance(entry, dict) or (sizes and isinstance(entry, list)):
+                parts[f"{path}[{name}]"] = entry
+        parts.pop(f"{path}[initial]", None)  # of Metashape, before its adjustment
+    if not parts:
+        yield path, value
+    for name, entry in parts.items():
+        yield from _leaves(entry, name)
+
+
+def _placed(path: str, value: Any) -> _Value:
+    block, _, leaf = path.rpartition(".")
+    field, words = _role(leaf, value)
+    told = words | _told(_WORD.findall(block))
+    return _Value(path, (block, words), field, told, value)
+
+
+def _role(key: str, value: Any) -> tuple[str, frozenset[str]]:
+    """The field that a name means but for some words, and these words."""
+    field = field_name(key)
+    listed = is_array(value)
+    if (field in FIELDS and not (listed and field in DISTORTION[1:])) or is_harmless(
+        key
+    ):
+        return field, frozenset()
+    words = _WORD.findall(key)
+    for i in range(1, len(words)):
+        for own, others in ((words[i:], words[:i]), (words[:i], words[i:])):
+            name = "".join(own)
+            meant = _SHORT.get(name.lower(), field_name(name))
+            if meant in FIELDS and listed == (meant in _OF_ARRAYS):
+                return meant, _told(others)
+    return key, frozenset()
+
+
+def _told(words: Iterable[str]) -> frozenset[str]:
+    """Words that tell a camera from others."""
+    lower = {word.lower() for word in words}
+    return frozenset({_SAME.get(word, word) for word in lower - _NEUTRAL})
+
+
+def _has_matrix(values: list[_Value]) -> bool:
+    own = {value.field: value.value for value in values}
+    return "fx" in own or is_array(own.get("camera_matrix"))
+
+
+def _has_view(values: list[_Value]) -> bool:
+    return has_view({value.field: value.value for value in values})
+
+
+def _fields(
+    home: Any, cameras: dict[Any, list[_Value]], values: list[_Value]
+) -> tuple[str, JsonObject]:
+    """Name and fields of one camera."""
+    own = cameras[home]
+    told = own[0].words
+    fields = {value.field: value.value for value in own}
+    hidden = {*fields, *_OF_ONE_CAMERA}
+    if not hidden.isdisjoint(DISTORTION):
+        hidden.update(DISTORTION)
+    for value in values:
+        block = value.home[0]
+        is_lens = value.field in DISTORTION or value.field in MODEL_NAMES
+        beside = block not in home[0]
+        if value.home in cameras:
+            continue
+        if beside and is_lens and len(cameras) > 1 and not value.words:
+            sure = False
+        elif value.words <= told:
+            sure = value.field in FIELDS or is_lens or not beside
+        elif any(value.words <= other[0].words for other in cameras.values()):
+            continue
+        else:
+            sure = is_lens and not told
+        if value.field in hidden and not (beside and is_lens):
+            continue
+        if fields.get(value.field) == value.value:
+            continue
+        name = value.field if sure and value.field not in hidden else value.path
+        fields[name] = value.value
+    names = [value.path for value in own if value.field in (*_OF_ARRAYS[:2], "fx")]
+    return " ".join(names) if home[1] else home[0], fields
