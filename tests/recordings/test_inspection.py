@@ -61,6 +61,6 @@ def test_planted_faults_are_reported() -> None:
     for lens, message in (
         ((26, 26, 25, 11), "far from the middle"),
         ((525, 525, 15.5, 11.5), "sees"),
-        ((26, 40, 15.5, 11.5), "square pixels"),
+        ((26, 40, 15.5, 11.5), "squeezed from 2.05:1 to 1.33:1; if yours were cut out"),
     ):
         assert message in warned(recording_of(TRAIN, TEST, Camera(32, 24, *lens)))

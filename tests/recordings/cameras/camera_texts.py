@@ -128,7 +128,10 @@ Extrinsic from "Depth"    To      "Color" :
 
  Translation Vector: -0.015  0  -0.0003
 """
-PRINTED = "[ 640x480  p[319.5 239.25]  f[525.25 526.5]  Brown Conrady [0.1 -0.02 0.001 1e-05 0.03] ]\n"
+PRINTED = (
+    "[ 640x480  p[319.5 239.25]  f[525.25 526.5]  Brown Conrady"
+    " [0.1 -0.02 0.001 1e-05 0.03] ]\n"
+)
 STRUCT = (
     "width: 640, height: 480, ppx: 319.5, ppy: 239.25, fx: 525.25, fy: 526.5,"
     " model: Brown Conrady, coeffs: [0.1, -0.02, 0.001, 1e-05, 0.03]\n"

@@ -19,8 +19,7 @@ D = [0.1, -0.05, 0.001, -0.002, 0.01]
 DIST = dict(zip(("k1", "k2", "p1", "p2", "k3"), D, strict=True))
 WIDE = {"fx": 600.0, "fy": 600.0, "cx": 639.5, "cy": 359.5}
 WIDE_SIZE = {"width": 1280, "height": 720}
-CAMERA = Camera(640, 480, **PLAIN, distortion=tuple(D))
-OTHER = {**PLAIN, "fx": 400.0, "fy": 400.0}
+CAMERA = Camera.from_matrix(MATRIX, *SIZE, tuple(D))
 RIGHT = [[520.0, 0, 319.5], [0, 520.0, 239.5], [0, 0, 1]]
 
 READ = {

@@ -186,6 +186,10 @@ REFUSED = {
         "give them in pixels",
     ),
     "skew": (json.dumps({**PLAIN, "skew": 0.5}), "'skew' is not known"),
+    "skew of a sphere": (
+        json.dumps({**PLAIN, "skew": 0.5, "camera_type": "ds", "xi": 0.1, "alpha": 0.5}),
+        "'skew' is not known",
+    ),
     "thin prism": (texts.COLMAP.replace("FULL_OPENCV", "THIN_PRISM_FISHEYE"), "THIN_PRISM_"),
     "metashape, b2": (
         texts.METASHAPE.replace("<k1>", "<b2>0.4</b2><k1>"), "'b2' is not known"

@@ -185,9 +185,10 @@ def test_of_several_cameras_the_one_of_the_images_is_read(tmp_path: Path) -> Non
     second = KALIBR.replace("cam0", "cam1").replace("525.25", "500")
     file = written(tmp_path, KALIBR + second)
     refused(
-        r"several cameras: cam0 \(640x480, fx 525\.2\), cam1 \(.*", read_camera, file
+        r"holds 2 cameras: cam0 \(640x480, fx 525\.2\), cam1 \(.*", read_camera, file
     )
-    refused("give a file of the right one", read_camera, file, (640, 480))
+    refused("such as FILE:cam0", read_camera, file, (640, 480))
+    assert read_camera(f"{file}:cam0") == RADTAN
     written(tmp_path, KALIBR + second.replace("[640, 480]", "[1280, 960]"))
     assert read_camera(file, (640, 480)) == RADTAN
     assert (
@@ -200,7 +201,7 @@ def test_of_several_cameras_the_one_of_the_images_is_read(tmp_path: Path) -> Non
         ORB_SLAM.replace("a1.", "a.") + "LEFT.K: [600, 0, 320, 0, 600, 240, 0, 0, 1]\n"
     )
     refused(
-        "outside of these .*, LEFT",
+        r"holds 2 cameras: Camera \(640x480, fx 525.2\), LEFT \(640x480, fx 600.0\)",
         read_camera,
-        written(tmp_path, stereo + "LEFT.D: [0]\n"),
+        written(tmp_path, stereo + "LEFT.D: [0]\nLEFT.width: 640\nLEFT.height: 480\n"),
     )

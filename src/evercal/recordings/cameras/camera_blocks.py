@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
-from evercal.recordings.cameras.camera_fields import (
+from evercal.recordings.cameras.camera_names import (
     DISTORTION,
     FIELDS,
     MODEL_NAMES,
@@ -29,10 +29,10 @@ _NEUTRAL = frozenset(
         "camera cameras cam image images img lens matrix mat k d m data model type intrinsic"
         " intrinsics parameter parameters params param calibration calib internal coefficient"
         " coefficients coeffs coeff coefs coef distortion distortions dist disto radial tangential"
-        " resolution size info values value sensor optical stream frame projection main",
+        " resolution size info values value sensor optical optics stream frame projection main",
     )
 )
-"""Words of names that do not tell cameras apart."""
+"""Words of names that do not distinguish cameras."""
 _SAME = {"color": "rgb", "colour": "rgb", "l": "left", "r": "right", "infrared": "ir"}
 """Words that mean the same."""
 _OF_ARRAYS = ("camera_matrix", "distortion_coefficients", "image_size")
@@ -47,10 +47,10 @@ class _Value(NamedTuple):
     path: str
     """Names that lead to it, with points between them."""
     home: tuple[str, frozenset[str]]
-    """Block, and the words of its own name that tell cameras apart."""
+    """Block, and the words of its own name that distinguish cameras."""
     field: str
     words: frozenset[str]
-    """All words of the path that tell cameras apart."""
+    """All words of the path that distinguish cameras."""
     value: Any
 
 
@@ -125,7 +125,7 @@ def _role(key: str, value: Any) -> tuple[str, frozenset[str]]:
 
 
 def _told(words: Iterable[str]) -> frozenset[str]:
-    """Words that tell a camera from others."""
+    """Words that distinguish a camera."""
     lower = {word.lower() for word in words}
     return frozenset({_SAME.get(word, word) for word in lower - _NEUTRAL})
 
@@ -145,8 +145,11 @@ def _fields(
     """Name and fields of one camera."""
     own = cameras[home]
     told = own[0].words
-    fields = {value.field: value.value for value in own}
-    hidden = {*fields, *_OF_ONE_CAMERA}
+    fields: JsonObject = {}
+    for value in own:
+        leaf = value.path.rpartition(".")[2]
+        fields[value.field if home[1] else leaf] = value.value
+    hidden = {*_OF_ONE_CAMERA, *(value.field for value in own)}
     if not hidden.isdisjoint(DISTORTION):
         hidden.update(DISTORTION)
     for value in values:
@@ -155,18 +158,16 @@ def _fields(
         beside = block not in home[0]
         if value.home in cameras:
             continue
-        if beside and is_lens and len(cameras) > 1 and not value.words:
-            sure = False
-        elif value.words <= told:
-            sure = value.field in FIELDS or is_lens or not beside
-        elif any(value.words <= other[0].words for other in cameras.values()):
+        sure = value.words <= told and (value.field in FIELDS or is_lens or not beside)
+        others = any(value.words <= other[0].words for other in cameras.values())
+        if others and not value.words <= told:
             continue
-        else:
-            sure = is_lens and not told
         if value.field in hidden and not (beside and is_lens):
             continue
         if fields.get(value.field) == value.value:
             continue
+        if beside and is_lens and len(cameras) > 1 and not value.words:
+            sure = False
         name = value.field if sure and value.field not in hidden else value.path
         fields[name] = value.value
     names = [value.path for value in own if value.field in (*_OF_ARRAYS[:2], "fx")]

@@ -5,7 +5,7 @@ are used. Pixel (0, 0) is the centre of the top-left pixel, and images are uprig
 """
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +13,17 @@ import numpy as np
 
 from evercal.geometry import Camera
 from evercal.geometry.camera import COEFFICIENT_COUNTS, COEFFICIENTS
+from evercal.recordings.cameras.camera_names import (
+    CAMERA_INFO,
+    DISTORTION,
+    FIELDS,
+    LENS,
+    MODEL_NAMES,
+    field_name,
+    is_array,
+    is_harmless,
+    plain_name,
+)
 from evercal.recordings.cameras.camera_notations import EXPECTED
 from evercal.recordings.cameras.field_of_view import (
     VIEW_NAMES,
@@ -22,34 +33,8 @@ from evercal.recordings.cameras.field_of_view import (
 from evercal.recordings.cameras.radial_models import RADIAL_MODELS, nearest_fisheye
 from evercal.recordings.poses.row_files import by_alias, is_number
 from evercal.storage.text_files import few
-from evercal.typing import Array, Floats, JsonObject, Record, Size
+from evercal.typing import Array, Floats, JsonObject, Record, Size, Strings
 
-_NAMES = by_alias("""
-camera_matrix: cameramatrix intrinsicmatrix mtx k camk cammtx cammatrix camerak
-camera_matrix: cameraintrinsics intrinsics intrinsic
-camera_matrix: projectionparameters
-distortion_coefficients: distortioncoefficients distortioncoeffs
-distortion_coefficients: distortionparameters distortionparams
-distortion_coefficients: distcoeffs distcoeff distortion dist
-distortion_coefficients: distcoefs distortioncoefs disto distortions distortioncoeff
-distortion_coefficients: cameradistortion lensdistortion cameradist cameradistcoeffs
-distortion_coefficients: camdist lenscoeffs lensdistortioncoefficients
-distortion_coefficients: coefficients coeffs d kc
-image_width: imagewidth width w resolutionwidth resolutionx
-image_height: imageheight height h resolutionheight resolutiony
-image_size: imagesize imgsize resolution size imagersize imageresolution
-fx: fx focallengthx focalx
-fy: fy focallengthy focaly
-cx: cx ppx principalpointx principalptx
-cy: cy ppy principalpointy principalpty
-k1: k1 radialdistortion1
-k2: k2 radialdistortion2
-k3: k3 radialdistortion3
-k4: k4 radialdistortion4
-p1: p1 tangentialdistortion1 tangentialdistortioncoefficientx
-p2: p2 tangentialdistortion2 tangentialdistortioncoefficienty
-""")
-"""Names of fields by their aliases."""
 _MODELS = {"": "brown"} | by_alias("""
 brown: brown plumbbob rationalpolynomial
 brown: brownconrady radtan radialtangential
@@ -70,30 +55,7 @@ ds: ds doublesphere
 division: divisionundistortion
 """)
 """Kinds of distortion by names of models, without spaces, dashes and underscores."""
-MODEL_NAMES = (
-    "distortionmodel",
-    "model",
-    "cameramodel",
-    "cameratype",
-    "intrinsictype",
-    "lensmodel",
-    "modeltype",
-    "projectionmodel",
-    "type",
-)
-"""Names of fields that hold the name of a model."""
 _PINHOLE = COEFFICIENTS["pinhole"]
-DISTORTION = ("distortion_coefficients", *_PINHOLE)
-"""Names of fields that hold distortion."""
-FIELDS = {*_NAMES.values(), *_PINHOLE}
-"""Names of fields of a camera; each may be stated once."""
-_CAMERA_INFO = {
-    "rectificationmatrix",
-    "projectionmatrix",
-    "header",
-    "roi",
-}
-"""Names of fields of ROS."""
 _OF_ROS = {"rectificationmatrix", "header"}
 """Names of fields that only ROS writes."""
 _RECTIFIED = {"p", "r"}
@@ -101,7 +63,7 @@ _RECTIFIED = {"p", "r"}
 _KNOWN = {
     *FIELDS,
     *MODEL_NAMES,
-    *_CAMERA_INFO,
+    *CAMERA_INFO,
     "binningx",
     "binningy",
     "fisheyemodel",
@@ -109,42 +71,8 @@ _KNOWN = {
 """Names of fields that are used, or that may be left out."""
 _CENTRAL = 0.05
 """Largest distance of a usual principal point from the middle, widths and heights."""
-_HARMLESS = re.compile(
-    r"error|rms|repro|resid|std|dev|sigma|covar|uncert|fps|rate|freq|square|board|marker|pattern"
-    r"|chess|tag|count|num|nr|frames|images|views|points|flags|date|time|stamp|version|serial|id$"
-    r"|index|baseline|depth|range|temp|apert(?!ureoffset)|expos|gain|fov|angle|focal|aspect|mm$|rotation|trans"
-    r"|^[rt]vec|quat|extrin|pose|position|orient|imu|noise|^rgb$|track|^bf$|^new|imagescale"
-    r"|overlap|^d[wh]$|perframe|center|radius|score|neighbor|^t\d|region|icam|stereo|thdepth"
-    r"|orbextract|viewer|system|accel|gyro|bias|walk|mocap|vignette|batch|unit|housing|rect|corner"
-    r"|^t$|^pos|^rot|euler|axes|axis|focus|fstop|near|far|clip|socket|firmware|port|seed|quality|channels|bits|buffer|cost"
-    r"|weight|speed|robot|joint|gripper|world|origin|name|^step|^bounds|limit|threshold|light|ambient|bright|white"
-)
-"""Names of numbers that do not change where a point lies in the image."""
 _PROJECTION = re.compile(r"(.*\.)?(p\d*|prect\d*|proj.*)$")
 """Names of projection matrices, which are for rectified images."""
-_LENS = re.compile(
-    r"disto|^dist(?!an)|coef|radial|tangent|^lens(?!pos|name|id|serial)|lenses|warp|aberr"
-)
-"""Names of numbers that do, whatever else the name says."""
-
-
-def is_harmless(key: str) -> bool:
-    """Whether a number of this name, or in this block, changes no pixel."""
-    parts = [_plain(part) for part in key.split(".")]
-    if any(map(_LENS.search, parts)):
-        return False
-    return any(part in _CAMERA_INFO or _HARMLESS.search(part) for part in parts)
-
-
-def is_array(value: object) -> bool:
-    """Whether a value holds numbers in rows: lists, or an array of OpenCV or ROS."""
-    return isinstance(value, list) or (isinstance(value, dict) and "data" in value)
-
-
-def field_name(key: object) -> str:
-    """The name that a key is an alias of, or else the key in lower case."""
-    plain = _plain(key)
-    return _NAMES.get(plain, plain)
 
 
 def named_fields(data: Record) -> JsonObject:
@@ -180,16 +108,16 @@ def camera_of(data: Record, size: Size | None) -> Camera:
             raise ValueError(
                 f"the image is a cut-out ({key} {value}); give the whole image's camera_info"
             )
-    plain = {*map(_plain, data)}
+    plain = {*map(plain_name, data)}
     is_ros = bool(plain & _OF_ROS) or plain >= _RECTIFIED
     if "lensmodel" in fields:  # of mrcal
         numbers = numbers_of(fields.get("camera_matrix"), "intrinsics")
         fields["camera_matrix"] = numbers[:4]
         fields["distortion_coefficients"] = numbers[4:]
-    used: Collection[str] = ()
+    unknown = dict(data)
     if "camera_matrix" not in fields and "fx" not in fields and has_view(fields):
         fields = pixels_of_view(fields, _size(fields, data, size))
-        used = VIEW_NAMES
+        unknown = {key: data[key] for key in data if field_name(key) not in VIEW_NAMES}
     models: JsonObject = {}
     for name in MODEL_NAMES:
         word = fields.get(name)
@@ -198,9 +126,11 @@ def camera_of(data: Record, size: Size | None) -> Camera:
         other = isinstance(word, int | float) and "lensposition" not in fields
         if name in fields and not other and (kind or name != "type"):
             models[kind] = word
-    for kind in models:
-        if kind in RADIAL_MODELS:
-            return _of_radial_model(kind, fields, _size(fields, data, size))
+    for kind, parameters in RADIAL_MODELS.items():
+        if kind in models:
+            camera = _of_radial_model(kind, fields, _size(fields, data, size))
+            _refuse_unknown(unknown, parameters)
+            return camera
     model = "pinhole"
     if "fisheye" in models or fields.get("fisheyemodel"):
         model = "fisheye"
@@ -216,7 +146,7 @@ def camera_of(data: Record, size: Size | None) -> Camera:
     _refuse_other_models(models, distortion)
     matrix = _matrix(fields, data)
     width, height = _size(fields, data, None if is_ros else size)
-    _refuse_unknown({key: data[key] for key in data if field_name(key) not in used})
+    _refuse_unknown(unknown)
     camera = Camera.from_matrix(matrix, width, height)
     camera = replace(camera, distortion=distortion, model=model)
     if size != camera.size:
@@ -245,7 +175,8 @@ def _of_radial_model(kind: str, fields: Record, size: tuple[Any, Any]) -> Camera
     distortion = []
     for name in DISTORTION:
         if fields.get(name):
-            distortion += numbers_of([fields[name]], name)
+            own = fields[name] if is_array(fields[name]) else [fields[name]]
+            distortion += numbers_of(own, name)
     if kind == "fov" and "fx" not in fields:
         numbers = [*distortion, *numbers]
         distortion = []
@@ -271,6 +202,8 @@ def _distortion(fields: Record, model: str) -> Floats | None:
             f"a fisheye has {', '.join(names)}, got {', '.join(others)}; leave others out"
         )
     key = "distortion_coefficients"
+    if stated and fields.get(key):
+        raise ValueError(f"{key} and {stated[0]} are both stated; keep one of them")
     stated = [name for name in names if name in fields]
     if key in fields:
         if str(fields[key]).lower() in ("none", "null"):
@@ -355,10 +288,10 @@ def _size(fields: Record, data: Record, size: Size | None) -> tuple[Any, Any]:
     return width, height
 
 
-def _refuse_unknown(data: Record) -> None:
+def _refuse_unknown(data: Record, known: Strings = ()) -> None:
     """Refuse numbers that may change where a point lies in the image."""
     for key, value in data.items():
-        if field_name(key) in _KNOWN or is_harmless(key):
+        if field_name(key) in (*_KNOWN, *known) or is_harmless(key):
             continue
         if isinstance(value, Mapping):
             value = value.get("data")
@@ -367,17 +300,17 @@ def _refuse_unknown(data: Record) -> None:
         if are_numbers and not _is_matrix(key, value, len(cells)):
             raise ValueError(
                 f"{key!r} is not known and may change the image; name distortion k1, k2, p1, p2,"
-                f" k3, or distortion_coefficients in this order, and leave other numbers out"
+                f" k3, or distortion_coefficients in this order, beside fx; leave other numbers out"
             )
 
 
 def _is_matrix(key: str, value: object, count: int) -> bool:
     """Whether numbers are a 3x3 or 4x4 matrix, or P of ROS, or another one in rows."""
-    if is_array(value) and _LENS.search(_plain(key)):
+    if is_array(value) and LENS.search(plain_name(key)):
         return False
     if count in (9, 16):
         return True
-    if count == 12 and _PROJECTION.match(_plain(key)):
+    if count == 12 and _PROJECTION.match(plain_name(key)):
         return True
     if not isinstance(value, list) or len(value) < 3:
         return False
@@ -422,10 +355,6 @@ def refuse_misfit(camera: Camera) -> None:
 
 def _keys(data: Record) -> str:
     return few([str(key) for key in data], most=10)
-
-
-def _plain(key: object) -> str:
-    return re.sub(r"[\s_-]", "", str(key).lower())
 
 
 def numbers_of(value: Any, name: str, count: int | None = None) -> list[float]:

@@ -60,9 +60,10 @@ def entries_of(text: str) -> JsonObject:
             return data
     except ValueError as error:
         problem = str(error)
-        if problem.startswith("not valid"):
-            line = re.search(r"line \d+", problem)
-            problem = f"{problem[:14]} ({line[0]})" if line else problem[:14]
+        if not problem.startswith("not valid"):
+            raise
+        line = re.search(r"line \d+", problem)
+        problem = f"{problem[:14]} ({line[0]})" if line else problem[:14]
     if start == "{":
         with suppress(ValueError, SyntaxError):
             data = ast.literal_eval(text.strip())
