@@ -120,6 +120,8 @@ class Export(args.Verb):
                 f" root frame with --via, because a tf frame has only one parent",
                 sys.stderr,
             )
+        for note in exported.notes:
+            say(f"note: {note}", sys.stderr)
         if calibration.lens:
             say(f"note: the pose is for {calibration.lens_in_words}", sys.stderr)
         if not self.out and not self.json:
@@ -136,6 +138,7 @@ class Export(args.Verb):
             "lens": calibration.lens,
             "camera": calibration.camera and calibration.camera.to_dict(),
             "verdict": verdict,
+            "notes": exported.notes,
             "files": files,
             "text": None if files else exported.text,
         }

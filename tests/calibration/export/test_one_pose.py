@@ -256,6 +256,7 @@ READERS: dict[str, Callable[[str], Read]] = {
 def test_every_format_of_one_pose_has_a_reader() -> None:
     others = {"npy", "camera_info", "moveit_samples", "tum", "colmap", "nerfstudio"}
     others |= {"joint_offsets", "corrected_urdf", "lerobot"}
+    others |= {"mujoco", "isaac", "sapien", "pybullet", "blender"}  # test_simulators.py
     assert FORMATS.keys() == READERS.keys() | others
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, TypeAlias, Unpack
 
-from evercal.calibration.export import joints as arm, writers as to
+from evercal.calibration.export import joints as arm, simulators, writers as to
 from evercal.calibration.export.read_back import require_read_back
 from evercal.calibration.export.request import (
     Export,
@@ -17,11 +17,12 @@ from evercal.choices import ExportFormat
 from evercal.classes import frozen, frozen_arrays
 from evercal.errors import InputError
 from evercal.storage import write_bytes
-from evercal.typing import PathLike
+from evercal.typing import PathLike, Strings
 
 Content: TypeAlias = str | bytes | dict[str, str]
 """Text, bytes, or the texts of a folder by file name."""
-_HOLD_INTRINSICS = ("camera_info", "opencv", "colmap", "nerfstudio")
+_SIMULATORS = ("mujoco", "isaac", "sapien", "pybullet", "blender")
+_HOLD_INTRINSICS = ("camera_info", "opencv", "colmap", "nerfstudio", *_SIMULATORS)
 """Formats that hold the intrinsics which their pose is for."""
 
 
@@ -81,6 +82,19 @@ FORMATS: dict[str, Exporter] = {
         to.colmap, "", "a model without points (folder)", "optical", True
     ),
     "nerfstudio": Exporter(to.nerfstudio, ".json", "transforms.json", "optical", True),
+    "mujoco": Exporter(simulators.mujoco, ".xml", "MuJoCo: an MJCF camera", "optical"),
+    "isaac": Exporter(
+        simulators.isaac, ".usda", "Isaac Sim and USD: a camera prim", "optical"
+    ),
+    "sapien": Exporter(
+        simulators.sapien, ".py", "SAPIEN, ManiSkill: pose and camera", "optical"
+    ),
+    "pybullet": Exporter(
+        simulators.pybullet, ".py", "PyBullet: view and projection matrix", "optical"
+    ),
+    "blender": Exporter(
+        simulators.blender, ".py", "Blender: a script that adds the camera", "optical"
+    ),
     "zivid": Exporter(to.zivid, ".txt", "4x4 matrix in millimetres for Zivid's SDK"),
     "ur": Exporter(to.ur, ".txt", "Universal Robots: p[x, y, z, rx, ry, rz]"),
     "kuka": Exporter(to.kuka, ".txt", "KUKA: {X, Y, Z, A, B, C}, mm and degrees"),
@@ -112,6 +126,8 @@ class Exported:
     """Exported text; empty for a binary file or a folder."""
     files: tuple[Path, ...]
     """Files that were written."""
+    notes: Strings = ()
+    """What the other program cannot hold."""
 
 
 def export_files(
@@ -161,10 +177,10 @@ def export_files(
         if estimated and key not in _HOLD_INTRINSICS:
             beside = Path(path).with_suffix(".camera_info.yaml")
             files += _write(beside, to.camera_info(export))
-        return Exported(exporter, export.calibration, text, files)
+        return Exported(exporter, export.calibration, text, files, tuple(export.notes))
     if not text:
         raise InputError(f"{key} is not text and cannot be printed; give `out`")
-    return Exported(exporter, export.calibration, text, ())
+    return Exported(exporter, export.calibration, text, (), tuple(export.notes))
 
 
 def _write(path: Path, content: Content) -> tuple[Path, ...]:

@@ -30,6 +30,7 @@ _PARSERS: dict[str, Callable[[str], object]] = {
     ".calib": yaml.safe_load,
     ".launch.py": partial(shlex.split, comments=True),
     ".launch": _of_xml,
+    ".xml": _of_xml,
     ".urdf": _of_xml,
     ".sh": shlex.split,
 }

@@ -93,6 +93,8 @@ class Export:
     """All options, as given."""
     stated: list[float] = field(default_factory=list)
     """The last `numbers`."""
+    notes: list[str] = field(default_factory=list)
+    """What the other program cannot hold."""
 
     @property
     def parent(self) -> str:
