@@ -14,12 +14,14 @@ from evercal.cli import args
 from evercal.cli.console import numbers, require_writable
 from evercal.errors import InputError
 from evercal.progress import progress_bar
+from evercal.typing import Size, Strings
 
 if TYPE_CHECKING:
     from evercal.calibration.boards.board import Board
     from evercal.calibration.boards.board_poses import BoardPoses
-    from evercal.calibration.boards.corners import BoardView
-    from evercal.calibration.boards.detection import Image
+    from evercal.calibration.boards.detection import Found, Image
+    from evercal.calibration.boards.tag_layout import Arrangement
+    from evercal.geometry import Camera
 
 _DICTIONARIES: dict[BoardKind, str] = {
     "chessboard": "",
@@ -59,6 +61,8 @@ class Detect(args.Verb):
     """Dictionary of markers or tags, OpenCV's name without DICT_."""
     tag: Annotated[int | None, args.shown("ID", "(default: any)")] = None
     """Number of the tag, or of the first marker of a grid."""
+    layout: Annotated[str | None, args.shown("FILE|estimate")] = None
+    """Tags of several numbers as one board: a file of where they lie, or by the images."""
     camera: args.File = None
     """File of the intrinsics; if omitted, they are estimated from the board."""
     lens: CameraModel = "pinhole"
@@ -102,7 +106,10 @@ class Detect(args.Verb):
             camera = read_camera_of_size(
                 self.camera, (width, height), "the first image"
             )
-        board, views = self._detected(files, board, width, height)
+        arrange = None
+        if self.layout:
+            arrange = self._arrangement(board, (width, height), camera)
+        board, views, notes = self._detected(files, board, width, height, arrange)
         detected = [view for view in views.values() if isinstance(view, BoardView)]
         if not camera:
             camera = calibrate_camera(detected, width, height, self.lens).camera
@@ -114,7 +121,7 @@ class Detect(args.Verb):
         poses.write(self.out)
         solve = ("solve", "--robot-poses", "FILE", "--camera-poses", self.out)
         then = (*solve, "--mount", "MOUNT")
-        self.answer(poses.to_dict(), *_lines(poses, warning), then=then)
+        self.answer(poses.to_dict(), *_lines(poses, notes, warning), then=then)
         return 0
 
     def _make(self, path: Path) -> int:
@@ -153,10 +160,28 @@ class Detect(args.Verb):
             tag=self.tag,
         )
 
+    def _arrangement(
+        self, board: "Board", size: Size, camera: "Camera | None"
+    ) -> "Arrangement":
+        from evercal.calibration.boards.tag_layout import Arrangement
+
+        if self.board != "apriltag":
+            raise InputError(
+                "--layout: give --board apriltag, for markers of any dictionary"
+            )
+        file = Path(self.layout or "")
+        if self.layout == "estimate":
+            file = None
+        return Arrangement(board, size, camera, file)
+
     def _detected(
-        self, files: Sequence[Path], board: "Board", width: int, height: int
-    ) -> "tuple[Board, dict[str, BoardView | str]]":
-        """The board with its first marker, and the corners of each image or a reason."""
+        self,
+        files: Sequence[Path],
+        board: "Board",
+        width: int,
+        height: int,
+        arrange: "Arrangement | None",
+    ) -> "Found":
         from evercal.calibration.boards.detection import find_boards
         from evercal.recordings import read_image
 
@@ -181,10 +206,10 @@ class Detect(args.Verb):
                     )
                 return image
 
-            return find_boards(list(by_name), read, board)
+            return find_boards(list(by_name), read, board, arrange)
 
 
-def _lines(poses: "BoardPoses", warning: str) -> Iterator[str]:
+def _lines(poses: "BoardPoses", notes: Strings, warning: str) -> Iterator[str]:
     for image in poses.images:
         if not image.camera_from_board:
             yield f"{image.name}: {image.reason}"
@@ -200,5 +225,6 @@ def _lines(poses: "BoardPoses", warning: str) -> Iterator[str]:
         f" {poses.corner_sigma_px:.2f} px; camera (from the {poses.camera_from})"
         f" fx {camera.fx:.2f}, fy {camera.fy:.2f}, cx {camera.cx:.2f}, cy {camera.cy:.2f}"
     )
+    yield from notes
     if warning:
         yield f"warning: {warning}"

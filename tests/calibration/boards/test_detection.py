@@ -195,7 +195,7 @@ def test_the_first_marker_of_a_grid_may_have_any_number(board: Board) -> None:
     images = {
         str(seed): photographed(printed, view_of(board, seed)) for seed in range(2)
     }
-    found, views = find_boards(
+    found, views, _ = find_boards(
         list(images), images.__getitem__, replace(board, tag=None)
     )
     assert found.tag == 9
@@ -310,7 +310,7 @@ def test_every_window_of_refinement_stays_between_edges() -> None:
 def test_an_image_that_cannot_be_read_keeps_its_reason_beside_a_grid() -> None:
     shown = photographed(APRILGRID, view_of(APRILGRID, 0))
     images = {"good": shown, "bad": "not an image"}
-    _, views = find_boards(list(images), images.__getitem__, APRILGRID)
+    _, views, _ = find_boards(list(images), images.__getitem__, APRILGRID)
     assert views["bad"] == "not an image"
     assert isinstance(views["good"], BoardView)
 

@@ -16,7 +16,7 @@ from typing import Any, Self, get_args
 from evercal.choices import BoardKind
 from evercal.classes import frozen
 from evercal.errors import InputError
-from evercal.typing import JsonObject
+from evercal.typing import Floats, JsonObject
 
 _LEAST_COUNT = {
     "chessboard": 3,
@@ -54,8 +54,15 @@ class Board:
     """Number of the tag, or of the first marker of a grid; if omitted, any."""
     gap_m: float = 0.0
     """Distance between two markers of a grid, metres."""
+    layout: tuple[Floats, ...] = ()
+    """Tags that are one board: number, then x y z of the four corners in the order of OpenCV's
+    print, metres. Empty for a single tag."""
 
     def __post_init__(self) -> None:
+        rows = tuple(tuple(row) for row in self.layout)
+        object.__setattr__(self, "layout", rows)
+        if any(len(row) != 13 for row in rows):
+            raise InputError("a row of a layout has 13 numbers: a tag and its corners")
         if self.kind not in get_args(BoardKind):
             raise InputError(
                 f"board {self.kind!r} is not known; use one of {get_args(BoardKind)}"

@@ -1,6 +1,7 @@
 """Detect printed boards in images with OpenCV."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -12,15 +13,15 @@ from evercal.calibration.boards.marker_layout import Markers, OtherBoard
 from evercal.calibration.boards.markers import (
     find_charuco,
     find_markers,
-    find_tag,
     grid_views,
     other_dictionary,
     sizes_pooled,
 )
+from evercal.calibration.boards.tags import tag_views, twice_notes
 from evercal.errors import InputError
 from evercal.geometry import norms
 from evercal.geometry.camera import resize_pixels
-from evercal.typing import Array, Image, Size
+from evercal.typing import Array, Image, Size, Strings
 
 _MAX_CHANGE = 0.3
 """Maximum change of the step from corner to corner, relative to the mean step."""
@@ -34,35 +35,58 @@ _MANY_IMAGES = 20
 """Number of images without any board, after which a search ends."""
 
 
+class Found(NamedTuple):
+    """A board in images of one camera."""
+
+    board: Board
+    """With the number of its first marker, and its layout."""
+    views: dict[str, Detection]
+    """Corners in each image, or a reason."""
+    notes: Strings = ()
+    """What is not used, a line each."""
+
+
 def find_board(image: Image, board: Board) -> Detection:
     """Detect the corners of a board in an image (H, W, 3) uint8 RGB, or return a reason."""
-    _, views = _settled({"": _look(image, board)}, board)
-    return views[""]
+    try:
+        return _settled({"": _look(image, board)}, board).views[""]
+    except InputError as error:
+        return str(error)
 
 
 def find_boards(
-    names: Sequence[str], read: Callable[[str], Image | str], board: Board
-) -> tuple[Board, dict[str, Detection]]:
+    names: Sequence[str],
+    read: Callable[[str], Image | str],
+    board: Board,
+    arrange: Callable[[Mapping[str, Markers]], tuple[Board, Strings]] | None = None,
+) -> Found:
     """Detect a board in images of one camera; return the corners in each, or a reason.
 
     `read` returns an image, or the reason why there is none. Also return the board, with its first
     marker. Images are searched in an order that spreads. If none shows the board, InputError; also
-    after a few images that show another board.
+    after a few images that show another board. `arrange` returns the board with a layout of the
+    tags in all images.
     """
     order = sorted(
         range(len(names)),
         key=lambda i: i * (5**0.5 - 1) / 2 % 1,
     )
-    found: dict[str, Detection | Markers] = {}
-    settled = board
-    views: dict[str, Detection] = {}
+    looked: dict[str, Detection | Markers] = {}
+    found = Found(board, {})
     for tried, i in enumerate(order, 1):
         image = read(names[i])
-        found[names[i]] = image if isinstance(image, str) else _look(image, board)
+        looked[names[i]] = image if isinstance(image, str) else _look(image, board)
         last = tried == len(names)
         early = tried <= _MANY_IMAGES and tried % _FEW_IMAGES == 0
+        if early and not last and _shows_tags(looked, board):
+            continue
         if last or early:
-            settled, views = _settled(found, board)
+            notes: Strings = ()
+            if last and arrange:
+                board, notes = arrange(_markers(looked))
+            found = _settled(looked, board)
+            found = found._replace(notes=notes + found.notes)
+            views = found.views
             reason = _no_board(views, len(names))
             if reason and any(isinstance(view, OtherBoard) for view in views.values()):
                 raise InputError(reason)
@@ -70,7 +94,23 @@ def find_boards(
                 images = [read(names[k]) for k in order[:_HINT_IMAGES]]
                 shown = [image for image in images if not isinstance(image, str)]
                 raise InputError(reason + other_dictionary(shown, board))
-    return settled, {name: views[name] for name in names}
+    ordered = {name: found.views[name] for name in names}
+    return found._replace(views=ordered)
+
+
+def _markers(looked: Mapping[str, Detection | Markers]) -> dict[str, Markers]:
+    return {name: own for name, own in looked.items() if isinstance(own, Markers)}
+
+
+def _shows_tags(
+    looked: Mapping[str, Detection | Markers],
+    board: Board,
+) -> bool:
+    """Whether tags are visible, which all images settle."""
+    if board.kind != "apriltag":
+        return False
+    shown = [{*own.ids, *own.twice} for own in _markers(looked).values()]
+    return any(own if board.tag is None else board.tag in own for own in shown)
 
 
 def _no_board(
@@ -106,26 +146,26 @@ def _look(
         return _find_chessboard(grey, board)
     if board.kind == "charuco":
         return find_charuco(grey, board)
-    if board.kind == "apriltag":
-        return find_tag(grey, board)
     return find_markers(grey, board)
 
 
 def _settled(
-    found: Mapping[str, Detection | Markers], board: Board
-) -> tuple[Board, dict[str, Detection]]:
-    """Return the board with its first marker, and the views; markers of all images decide."""
-    markers: dict[str, Markers] = {}
+    found: Mapping[str, Detection | Markers],
+    board: Board,
+) -> Found:
+    """Settle the board with its first marker, and the views; markers of all images decide."""
+    markers = _markers(found)
     views: dict[str, Detection] = {}
     for name, detection in found.items():
-        if isinstance(detection, Markers):
-            markers[name] = detection
-        else:
+        if not isinstance(detection, Markers):
             views[name] = detection
     if not markers:
-        return board, sizes_pooled(views)
-    settled, of_grid = grid_views(markers, board)
-    return settled, of_grid | views
+        return Found(board, sizes_pooled(views))
+    settle = grid_views
+    if board.kind == "apriltag":
+        settle = tag_views
+    settled, of_markers = settle(markers, board)
+    return Found(settled, of_markers | views, twice_notes(markers.values()))
 
 
 def _find_chessboard(grey: Image, board: Board) -> Detection:

@@ -16,6 +16,7 @@ from evercal.calibration.boards.corners import (
     Bend,
     BoardPose,
     BoardView,
+    Shape,
     board_pose,
     lens_vector,
     strays,
@@ -129,7 +130,7 @@ def lens_estimate(
     poses: Sequence[BoardPose],
     sigma_px: float,
     camera: Camera,
-    bend: Bend,
+    bend: Shape,
     prior: LensPrior,
 ) -> ArrayPair:
     """Estimate the change (q,) of the intrinsics and the bend that board poses were fitted with.
@@ -170,7 +171,7 @@ def moved_camera(camera: Camera, change: Array) -> Camera:
 
 
 def fitted_poses(
-    views: Sequence[BoardView], camera: Camera, starts: Sequence[SE3] | SE3, bend: Bend
+    views: Sequence[BoardView], camera: Camera, starts: Sequence[SE3] | SE3, bend: Shape
 ) -> list[BoardPose]:
     """Fit the pose of the board in every view from its start."""
     pairs = zip(views, starts, strict=True)
@@ -189,13 +190,13 @@ def calibrate_camera(
             f"the board was detected in {len(views)} images, intrinsics take at least {MIN_VIEWS};"
             f" take 15 with the board tilted by 20 to 45 deg, or give `camera`"
         )
-    views = _consistent(views, _rough(views, width, height, model))
+    views = _consistent(views, rough_camera(views, width, height, model))
     if len(views) < MIN_VIEWS:
         raise InputError(
             f"the corners of {len(views)} images are those of a flat board, intrinsics take at"
             f" least {MIN_VIEWS}; check `size`, or give `camera`"
         )
-    camera = _rough(views, width, height, model)
+    camera = rough_camera(views, width, height, model)
     prior = LensPrior.usual(camera)
     bend = Bend.none(views)
     information = prior.information
@@ -257,7 +258,7 @@ def _middle(
     return (width - 1) / 2, (height - 1) / 2
 
 
-def _rough(
+def rough_camera(
     views: Sequence[BoardView], width: int, height: int, model: CameraModel
 ) -> Camera:
     """Return a camera without distortion whose only unknown is the focal length."""

@@ -57,6 +57,16 @@ class Markers(NamedTuple):
     """(m,) number of the marker at its end."""
     steps: Plane
     """(m,) in axes and sides of the marker at the start."""
+    twice: IntArray
+    """Numbers that are visible at two places or more; they are not among `ids`."""
+
+    def without(self, numbers: Iterable[int]) -> "Markers":
+        """The markers of other numbers, without their steps."""
+        use = ~np.isin(self.ids, list(numbers))
+        none = self.start[:0]
+        return Markers(
+            self.ids[use], self.corners[use], none, none, self.steps[:0], none
+        )
 
 
 class MarkerLayout(NamedTuple):

@@ -78,20 +78,24 @@ def find_markers(grey: Image, board: Board) -> Markers:
     # places their corners one cell inside.
     if board.kind != "charuco" and board.dictionary.startswith("APRILTAG"):
         borders = [2, 1]
-    squares: dict[int, Array] = {}
+    squares: dict[int, list[Array]] = {}
     for border in borders:
         detected = _detected_markers(grey, board, border)
         squares = max(squares, detected, key=len)
-        if _is_complete(detected, board):
+        if _is_complete(squares, board):
             break
-    ids = np.array(list(squares), np.int64)
-    corners = np.reshape(list(squares.values()), (-1, 4, 2)).astype(float)
-    if squares:
+    once = [number for number, places in squares.items() if len(places) == 1]
+    twice = [number for number, places in squares.items() if len(places) > 1]
+    ids = np.array(once, np.int64)
+    corners = np.array([squares[number][0] for number in once], float)
+    if once:
         corners = squares_by_their_sides(grey, corners)
+    corners = corners.reshape(-1, 4, 2)
     return Markers(
         ids,
         corners,
         *_steps(ids, corners),
+        np.array(twice, np.int64),
     )
 
 
@@ -99,33 +103,39 @@ def _detected_markers(
     grey: Image,
     board: Board,
     border: int,
-) -> dict[int, Array]:
-    """Return the corners of markers with a border of so many cells, by number."""
+) -> dict[int, list[Array]]:
+    """Return the corners of markers with a border of so many cells, by number; mostly one each."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border
     thresholds = _THRESHOLDS
     if board.kind == "charuco":
         thresholds = _CHARUCO_THRESHOLDS
-    markers: dict[int, Array] = {}
+    markers: dict[int, list[Array]] = {}
     for threshold in thresholds:
         parameters.adaptiveThreshConstant = threshold
         detector = cv2.aruco.ArucoDetector(dictionary_of(board), parameters)
         squares, numbers, _ = detector.detectMarkers(grey)
-        if numbers is not None:
+        for number, square in zip(np.ravel(numbers), squares, strict=False):
+            corners = np.reshape(square, (4, 2)).astype(float)
+            places = markers.setdefault(int(number), [])
             # Markers of earlier thresholds keep their corners.
-            ids = np.ravel(numbers).astype(int).tolist()
-            corners = [np.asarray(square, np.float32) for square in squares]
-            markers = dict(zip(ids, corners, strict=True)) | markers
+            if not any(_same_place(corners, other) for other in places):
+                places.append(corners)
         if _is_complete(markers, board):
             break
     return markers
 
 
+def _same_place(corners: Array, others: Array) -> bool:
+    apart = np.linalg.norm(corners.mean(0) - others.mean(0))
+    return bool(apart < np.linalg.norm(others[0] - others[2]) / 2)
+
+
 def _is_complete(
-    markers: Mapping[int, Array],
+    markers: Mapping[int, object],
     board: Board,
 ) -> bool:
-    if board.kind == "apriltag" and board.tag is not None:
+    if board.kind == "apriltag":
         return board.tag in markers
     return len(markers) >= max(1, board.columns * board.rows)
 
@@ -160,26 +170,8 @@ def _steps(
     return ids[start], ids[end], (x + 1j * y) / depth
 
 
-def find_tag(grey: Image, board: Board) -> Detection:
-    """Detect one tag, or return a reason."""
-    markers = find_markers(grey, board)
-    ids = markers.ids.tolist()
-    matches = [k for k in np.argsort(ids) if board.tag in (None, ids[k])]
-    if len(matches) == 1:
-        points = _in_space(board.size_m * SQUARE.conj())
-        return BoardView(points, markers.corners[matches[0]])
-    if matches:
-        names = ", ".join(str(ids[k]) for k in matches)
-        return f"several tags ({names}); select one with `tag`"
-    reason = f"no tag of {board.dictionary}"
-    if board.tag is not None:
-        reason = f"no tag {board.tag} of {board.dictionary}"
-    if ids:
-        reason += f"; it shows {', '.join(map(str, sorted(ids)))}"
-    return reason
-
-
-def _in_space(plane: Plane) -> Array:
+def in_space(plane: Plane) -> Array:
+    """Return points (n, 3) of a plane."""
     return np.stack([plane.real, plane.imag, 0 * plane.real], -1).reshape(-1, 3)
 
 
@@ -236,7 +228,7 @@ def grid_views(
             cells = layout.cells(markers.ids[use])
             origins = (board.size_m + board.gap_m) * cells
             corners = board.size_m * (layout.on_board(SQUARE) + 0.5 + 0.5j)
-            points = _in_space(origins[:, None] + corners)
+            points = in_space(origins[:, None] + corners)
             views[name] = BoardView(
                 points,
                 markers.corners[use].reshape(-1, 2),
