@@ -61,6 +61,27 @@ def test_exact_pairs_give_the_exact_transform(mount: Mount) -> None:
     assert start.pairs == start.of_pairs
 
 
+@pytest.mark.parametrize("mount", [EYE_IN_HAND, EYE_TO_HAND])
+@pytest.mark.parametrize("axis", range(2), ids=["mirrored", "upside down"])
+def test_mirrored_images_are_named(mount: Mount, axis: int) -> None:
+    """They agree with the motion of the gripper, with all points behind the camera."""
+    for seed in range(3):
+        poses = grippers(15, seed)
+        pairs = image_pairs(poses, TRUTH, 0.3)
+        for pair in pairs:
+            pair.rays[..., axis] *= -1
+        with pytest.raises(InputError, match="agree only mirrored"):
+            start_from_matches(poses, pairs, mount)
+
+
+def test_left_handed_poses_are_named() -> None:
+    poses = grippers(15, 4)
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    left_handed = SE3.from_matrix(mirror @ poses.matrix() @ mirror)
+    with pytest.raises(InputError, match="poses of a left-handed frame"):
+        start_from_matches(left_handed, image_pairs(poses, TRUTH), EYE_IN_HAND)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_wrong_pairs_are_rejected(seed: int) -> None:
     poses = grippers(30, seed)

@@ -11,7 +11,7 @@ from evercal.calibration.from_map.hand_eye_start import HandEyeStart
 from evercal.calibration.from_map.image_pairs import ImagePair
 from evercal.calibration.held_thing.background import background_motion
 from evercal.calibration.held_thing.moving_parts import (
-    MovingPart,
+    PartOfImage,
     in_full_size,
     moving_parts,
     reduced,
@@ -70,7 +70,7 @@ def test_what_stands_still_is_removed(noise: float, gain: float) -> None:
     frames, masks = frames_of(8, noise, gain)
     moving, share = moving_parts(frames)
     assert 0.7 < share < 0.95
-    assert all(isinstance(frame.image, MovingPart) for frame in moving)  # read again
+    assert all(isinstance(frame.image, PartOfImage) for frame in moving)  # read again
     for frame, old, mask in zip(moving, frames, masks, strict=True):
         change = np.abs(frame.read_image().astype(int) - old.read_image())[..., 0]
         assert (change[mask] <= 2).mean() > 0.9

@@ -142,9 +142,10 @@ def test_a_warped_image_has_no_confident_wrong_answer(
 
 def test_a_mirrored_image_is_refused_by_name(bedroom: Localizer) -> None:
     mirror = np.array([[-1.0, 0, 319], [0, 1, 0]])
-    answers = located(bedroom, mirror, (ROOM.test[24], ROOM.test[27]))
+    answers = located(bedroom, mirror, ROOM.test[::6])
     assert all(answer.status != "ok" for answer, _ in answers)
-    assert any("the image is mirrored" in answer.reason for answer, _ in answers)
+    named = ["the image is mirrored" in answer.reason for answer, _ in answers]
+    assert np.mean(named) > 0.7
     plain = located(bedroom, np.eye(2, 3), ROOM.test[::10])
     assert all(answer.status == "ok" for answer, _ in plain)
 

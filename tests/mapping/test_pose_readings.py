@@ -66,7 +66,10 @@ def jumped(share: float) -> Change:
     ("change", "cause"),
     [
         (SE3.inverse, "if they are camera_from_base, the inverse"),
-        (mirrored, "if they are left-handed, with y mirrored"),
+        (
+            mirrored,
+            "if they are left-handed with y mirrored, or the images are mirrored",
+        ),
         (later, r"if they are those of image i\+3 for image i"),
         (
             lambda p: SE3(np.roll(p.rotation_wxyz, 1, 1), p.translation_m),

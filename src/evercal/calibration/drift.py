@@ -5,7 +5,7 @@ shift is more accurate than either pose: to the scatter of the images, and a flo
 light and of objects in view.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -30,7 +30,7 @@ from evercal.calibration.located import (
 )
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, axis_deviation, deviations, length_mm_deg
-from evercal.recordings.images import NamedPictures
+from evercal.recordings.images import NamedPictures, pixels_of
 from evercal.typing import Array
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ _LEAST_MM = 0.7
 """Smaller shifts, millimetres, are no move."""
 _LEAST_DEG = 0.04
 """Smaller rotations, degrees, are no move."""
+_LEAST_FOCAL = 0.005
+"""Smaller changes of the focal length are none, as a share."""
 _CAMERA_OR_GRIP = (
     f"The camera, or the thing in the gripper: {LEAST_GRIPS} images that turn it about two axes"
     " show which of them moved."
@@ -83,7 +85,11 @@ def check(
     localizer = within_reference(localizer, reference)
     located = locate(localizer, images, camera or reference.camera, on_image)
     if not shows_held_thing(localizer, located, base_from_gripper):
-        return shift_between(reference, fuse(located), located, localizer)
+        shift = shift_between(reference, fuse(located), located, localizer)
+        notes = [lens_change(located, reference)]
+        if shift.moved:
+            notes.append(_moved_apart(localizer, images, located, reference))
+        return replace(shift, note=" ".join(filter(None, notes)))
     assert base_from_gripper, "a held thing needs gripper poses"
     grip = held_again(located, base_from_gripper)
     if grip:
@@ -98,6 +104,57 @@ def check(
     if shift.moved and sum(item.is_located for item in located) < LEAST_GRIPS:
         return replace(shift, note=_CAMERA_OR_GRIP)
     return shift
+
+
+def lens_change(located: Sequence[ImagePose], reference: Calibration) -> str:
+    """What the images show of a focal length that differs from the calibration's; or nothing."""
+    lens = reference.camera
+    ratios = []
+    for item in located:
+        own = item.estimate.camera
+        if own and lens and lens.fits(*own.size):
+            ratios.append(own.fx / lens.resized(*own.size).fx - 1)
+    if not ratios:
+        return ""
+    change = float(np.median(ratios))
+    if abs(change) < _LEAST_FOCAL:
+        return ""
+    return (
+        f"The lens has changed: the focal length differs by {100 * change:+.1f} % from that of the"
+        " calibration. Fix focus and zoom, and calibrate again."
+    )
+
+
+def _moved_apart(
+    localizer: "Localizer",
+    images: NamedPictures,
+    located: Sequence[ImagePose],
+    reference: Calibration,
+) -> str:
+    """What the images show of landmarks that did not move with the others; or nothing."""
+    from evercal.localization.unmoved import unmoved
+
+    stayed = []
+    moved = []
+    for (_, picture), item in zip(images, located, strict=True):
+        estimate = item.estimate
+        if estimate.scene is None or not item.is_located:
+            continue
+        scene = localizer.contents.scene(estimate.scene)
+        image = pixels_of(picture)
+        then = reference.parent_from_child
+        camera = reference.camera
+        share = unmoved(localizer, image, camera, scene, then, item.pose)
+        stayed.append(share)
+        moved.append(estimate.inlier_ratio)
+    if not stayed or not np.median(stayed):
+        return ""
+    share = np.median(stayed) / (np.median(stayed) + np.median(moved))
+    return (
+        f"Not all of the scene has moved against the camera: {100 * (1 - share):.0f} % of the"
+        f" landmarks have, {100 * share:.0f} % stand where they stood. Either things moved, such as"
+        " a table with all on it, or the camera moved together with the rest."
+    )
 
 
 def shift_between(

@@ -38,7 +38,9 @@ class LearnedScene:
     set_aside: Mapping[str, Floats] = field(default_factory=dict)
     """See `LearnReport.set_aside`."""
 
-    def report(self, contents: MapContents, began: float) -> LearnReport:
+    def report(
+        self, contents: MapContents, began: float, fixed_share: float = 0.0
+    ) -> LearnReport:
         """The report of a scene that joins `contents`; `began` is a time of `perf_counter`."""
         adjusted = self.built.adjusted
         if not self.metric:
@@ -54,6 +56,7 @@ class LearnedScene:
             set_aside=self.set_aside,
             landmarks=self.scene.landmarks,
             adjusted=adjusted,
+            fixed_share=fixed_share,
         )
 
 

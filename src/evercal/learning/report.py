@@ -70,6 +70,8 @@ class LearnReport:
     """Changes by bundle adjustment; None for networks."""
     hand_eye: "HandEye | None" = None
     """The estimated camera on the gripper; None where the recording states camera poses."""
+    fixed_share: float = 0.0
+    """Share of the image that shows the same in all images and is not learned from."""
     same_place: tuple[SamePlace, ...] = ()
     """Scenes of the map that show the same place."""
 

@@ -11,6 +11,7 @@ from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.processes import one_product_thread
 from evercal.progress import OnProgress
 from evercal.recordings import posed_recording
+from evercal.recordings.fixed_pixels import without_fixed_pixels
 from evercal.recordings.frame import Recording, lacks_camera_poses
 from evercal.recordings.held_out import require_frames, split_held_out
 
@@ -48,6 +49,7 @@ def learn_scene(
         )
     recording = posed_recording(recording)
     require_frames(recording)
+    recording, fixed_share = without_fixed_pixels(recording)
     split = split_held_out(recording.train)
     learned = learn_posed(recording, split, contents, budget, options, on_progress)
-    return learned.scene, learned.report(contents, began)
+    return learned.scene, learned.report(contents, began, fixed_share)

@@ -35,6 +35,7 @@ def stated_warnings(adjusted: Adjusted, camera_stated: bool) -> Iterator[str]:
         yield from _common(adjusted)
         yield from _shared(adjusted)
     yield from _intrinsics(adjusted)
+    yield from _changed_lens(adjusted)
     if abs(adjusted.time_shift_frames) > MOST_SHIFT_FRAMES:
         yield (
             f"the images lag their stated poses by {adjusted.time_shift_frames:+.2f} frame"
@@ -98,6 +99,18 @@ def _intrinsics(adjusted: Adjusted) -> Iterator[str]:
             f"the images move the corners of the image by {adjusted.corner_px:.1f} px: fx, fy, cx,"
             f" cy and distortion are stated as {stated}, adjusted {now}; check the camera file"
         )
+
+
+def _changed_lens(adjusted: Adjusted) -> Iterator[str]:
+    change = adjusted.focal_change
+    if not change:
+        return
+    how = f"differs by {100 * change:.1f} % (standard deviation) from image to image"
+    if adjusted.focal_change_at:
+        how = f"changes by {100 * change:+.1f} % or more at {adjusted.focal_change_at}"
+    yield (
+        f"the focal length {how}, as by autofocus or another zoom: fix both and record again"
+    )
 
 
 def _pinhole(record: JsonObject) -> str:

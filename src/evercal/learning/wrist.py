@@ -19,6 +19,7 @@ from evercal.mapping.build import MapOptions
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.progress import OnProgress
+from evercal.recordings.fixed_pixels import without_fixed_pixels
 from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Recording
 from evercal.recordings.held_out import HeldOutSplit, split_held_out
 from evercal.robot.mount import EYE_IN_HAND
@@ -41,14 +42,18 @@ def learn_wrist(
     `gripper_from_camera` is a rough one that the estimate is compared with.
     """
     began = perf_counter()
-    posed, start = _posed_by_gripper(recording, contents, on_progress)
+    shown, fixed_share = without_fixed_pixels(recording)
+    try:
+        posed, start = _posed_by_gripper(shown, contents, on_progress)
+    except InputError as error:
+        raise InputError(f"{recording.name}: {error}{_still(recording)}") from None
     split = split_held_out(posed.train)
     if len(split.held_out) < LEAST_ANSWERS:
         split = HeldOutSplit(posed.train, ())
     budget = replace(budget, least=MIN_GRIPPER_FRAMES)
     options = replace(options.for_hand_eye(EYE_IN_HAND), arm=start.arm)
     learned = learn_posed(posed, split, contents, budget, options, on_progress)
-    report = learned.report(contents, began)
+    report = learned.report(contents, began, fixed_share)
     hand_eye = hand_eye_of(start, learned.built, posed.train, gripper_from_camera)
     return learned.scene, replace(report, hand_eye=hand_eye)
 
@@ -59,15 +64,17 @@ def _posed_by_gripper(
     """The recording with rough camera poses, and the first estimate that they are from."""
     frames = gripper_frames(recording)
     encoder = contents.encoder
-    try:
-        start = hand_eye_start(recording, frames, EYE_IN_HAND, encoder, on_progress)
-    except InputError as error:
-        hint = ""
-        still = moving_parts(frames)[1]
-        if still > STILL_SHARE:
-            hint = (
-                f"; {100 * still:.0f} % of what the images show stands still: 'evercal eye-to-hand'"
-                " calibrates a fixed camera by a thing in the gripper"
-            )
-        raise InputError(f"{recording.name}: {error}{hint}") from None
+    start = hand_eye_start(recording, frames, EYE_IN_HAND, encoder, on_progress)
     return start.posed(recording, frames), start
+
+
+def _still(recording: Recording) -> str:
+    """A hint where the camera looks fixed."""
+    frames = gripper_frames(recording)
+    still = moving_parts(frames)[1]
+    if still < STILL_SHARE:
+        return ""
+    return (
+        f"; {100 * still:.0f} % of what the images show stands still: 'evercal eye-to-hand'"
+        " calibrates a fixed camera by a thing in the gripper"
+    )

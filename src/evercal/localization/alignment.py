@@ -171,6 +171,21 @@ def align_pose(
     return refined
 
 
+def matches_at(
+    image: SearchedImage,
+    keyframes: Sequence[AlignedLandmarks],
+    at: SE3,
+    options: AlignmentOptions,
+) -> Observed | None:
+    """The landmarks of keyframes that match near their places in an image from a known pose.
+
+    The pose is map_from_camera. None if too few match.
+    """
+    search = _Search(image.pyramid, keyframes, options)
+    pose = at.rotation_matrix(), at.translation_m
+    return search.run(options.rounds[-1], image.camera, pose, None)
+
+
 def _shift_by_intrinsics_px(camera: Camera, change: Array) -> float:
     """Shift of pixels by a change (5,) of the intrinsics; a fourth of the image moves more."""
     if not change.any():

@@ -14,14 +14,16 @@ from evercal.localization.other_bases import InBase
 from evercal.mapping.scene_map import SceneMap
 from evercal.typing import Array, Pair
 
+REQUIRED_SUPPORT = -math.log10(acceptance.FALSE_ACCEPTS)
+"""Support of an accepted pose."""
+
 
 def rejection(hypothesis: Hypothesis, scene: SceneMap) -> str:
     """Why a pose is not accepted."""
     share = f"{100 * hypothesis.inlier_ratio:.0f} %"
-    required = -math.log10(acceptance.FALSE_ACCEPTS)
     return (
         f"{hypothesis.inliers} inliers, {share} of the landmarks of {scene.name} that should be"
-        f" visible: support {hypothesis.support:.1f}, {required:.1f} is required"
+        f" visible: support {hypothesis.support:.1f}, {REQUIRED_SUPPORT:.1f} is required"
     )
 
 
@@ -88,7 +90,10 @@ def answer(
     `size` are height and width of the image; `mirrored` is the support of its mirror image.
     """
     if not best:
-        return PoseEstimate.failed("fewer than 6 inliers", milliseconds)
+        reason = "fewer than 6 inliers"
+        if mirrored > REQUIRED_SUPPORT:
+            reason = _mirrored_reason(0.0, mirrored)
+        return PoseEstimate.failed(reason, milliseconds)
     rejected = PoseEstimate(
         status="unknown_scene",
         reason="",
@@ -101,7 +106,10 @@ def answer(
         support=best.support,
     )
     if not accepted(best):
-        return replace(rejected, reason=rejection(best, scene))
+        reason = rejection(best, scene)
+        if mirrored > REQUIRED_SUPPORT:
+            reason = _mirrored_reason(best.support, mirrored)
+        return replace(rejected, reason=reason)
     misfit = _misfit(best)
     estimate, terms = in_base(best, scene, misfit)
     rejected = replace(rejected, parent_frame=scene.parent_frame, base=scene.base)
@@ -165,14 +173,11 @@ def _useless(
 ) -> str:
     """Why an accepted pose is of no use; empty where it is of use."""
     if mirrored > best.support:
-        return (
-            f"the image is mirrored: its mirror image has support {mirrored:.1f},"
-            f" the image {best.support:.1f}"
-        )
+        return _mirrored_reason(best.support, mirrored)
     if isinstance(best, Aligned):
         camera = best.camera
         less = best.support - unlikely(camera, best.change)
-        if less < -math.log10(acceptance.FALSE_ACCEPTS):
+        if less < REQUIRED_SUPPORT:
             return (
                 f"it needs a principal point at ({camera.cx:.0f}, {camera.cy:.0f}) of"
                 f" {camera.width}x{camera.height} px: give the whole image as the camera took it"
@@ -185,6 +190,13 @@ def _useless(
     if misfit:
         return f"{reason}: {misfit.reason}"
     return reason
+
+
+def _mirrored_reason(support: float, mirrored: float) -> str:
+    return (
+        f"the image is mirrored: its mirror image has support {mirrored:.1f}, the image"
+        f" {support:.1f}; switch the mirror of the camera off"
+    )
 
 
 def _uncertain_reason(position: float, scene: SceneMap) -> str:

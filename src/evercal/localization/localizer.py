@@ -37,7 +37,7 @@ from evercal.recordings.images import as_rgb
 from evercal.typing import Image, IntArray, PathLike, Strings
 
 MIRRORED = 4.0
-"""The mirror image is tried where a pose has less than this many times the required support."""
+"""The mirror image is tried where no pose has this many times the required support."""
 
 
 class Localizer:
@@ -124,8 +124,8 @@ class Localizer:
                 best, other = in_other_base(self.poses, query, best)
             else:
                 other = InBase.of(contents.scenes[best.scene], rival)
-            if not accepted(best, MIRRORED):
-                mirrored = self._mirrored_support(query)
+        if not accepted(best, MIRRORED):
+            mirrored = self._mirrored_support(query)
         milliseconds = 1000 * (perf_counter() - began)
         scene = contents.scenes[best.scene if best else 0]
         estimate = answer(best, scene, image.shape[:2], milliseconds, other, mirrored)

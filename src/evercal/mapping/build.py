@@ -21,6 +21,7 @@ from evercal.mapping.bundle_adjustment import BundleAdjustment
 from evercal.mapping.bundle_equations import Adjustment
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.mapping.bundle_tracks import bundle_tracks
+from evercal.mapping.changed_lens import LensChange
 from evercal.mapping.map_frame import (
     MapFrame,
     Similarity,
@@ -313,8 +314,14 @@ def _finish(
     if adjustment:
         doubtful = np.flatnonzero(adjustment.weight < DOUBTFUL_WEIGHT)
         frame = _map_frame(adjustment, numbers, options)
+        lens = LensChange.of(adjustment.focal_changes)
+        at = ""
+        if lens.first >= 0:
+            at = frames.frames[lens.first].name
         adjusted = replace(
             Adjusted.of(adjustment, stated, camera),
+            focal_change=lens.size,
+            focal_change_at=at,
             doubtful_poses=frames.names(doubtful),
             shared_mm=1000 * frame.shared_m,
         )

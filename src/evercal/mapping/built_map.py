@@ -53,6 +53,10 @@ class Adjusted:
     """Median depth of the landmarks; None without adjustment, or where the unit is unknown."""
     focal_percent: float = 0.0
     """Change of the focal length."""
+    focal_change: float = 0.0
+    """Change of the focal length within the recording, relative, see `LensChange`; 0 for none."""
+    focal_change_at: str = ""
+    """First frame after it; empty where the focal length differs from frame to frame."""
     residual_px: float | None = None
     """Median reprojection error after the adjustment; None without adjustment."""
     pose_sigma_mm: float | None = 0.0

@@ -33,6 +33,7 @@ from evercal.mapping.bundle_equations import (
     StatedFrames,
 )
 from evercal.mapping.bundle_options import FIXED, BundleOptions
+from evercal.mapping.changed_lens import focal_changes
 from evercal.mapping.stated_errors import StatedErrors, Variances
 from evercal.mapping.variance_components import (
     HIDDEN,
@@ -359,6 +360,12 @@ class BundleAdjustment:
             weight=np.minimum(variances.weight, 1.0),
             covariance=np.stack([columns.T @ columns for columns in by_pose]),
             inverse_depth=parameters.inverse_depth,
+            focal_changes=focal_changes(
+                tracks,
+                linearised,
+                self.frames.cameras(parameters),
+                noise_of(linearised) * self.options.correlation,
+            ),
             offsets=parameters.shared[joints],
             offsets_covariance=offsets + systematic[joints, joints],
             offsets_prior=np.sqrt(prior),

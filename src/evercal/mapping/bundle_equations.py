@@ -368,6 +368,8 @@ class Adjustment:
     """(n, 6, 6) of the adjusted poses, camera frame."""
     inverse_depth: Array
     """(p,) per metre."""
+    focal_changes: Array
+    """(n, 2) see `changed_lens.focal_changes`."""
     offsets: Array
     """(k,) offsets of the joints of an arm, radians, or metres of sliding joints."""
     offsets_covariance: Array

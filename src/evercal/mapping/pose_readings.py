@@ -89,7 +89,7 @@ def _readings(stated: SE3) -> Iterator[tuple[str, SE3]]:
         signs = np.ones(3)
         signs[axis] = -1
         mirrored = SE3(quaternions * [1, *-signs], positions * signs)
-        yield f"left-handed, with {name} mirrored", mirrored
+        yield f"left-handed with {name} mirrored, or the images are mirrored", mirrored
     rows = np.arange(len(stated))
     for step in range(-MOST_LATE, MOST_LATE + 1):
         shifted = stated[np.clip(rows + step, 0, rows[-1])]

@@ -44,6 +44,19 @@ class MaskedImage(StoredImage):
         return without(image, mask)
 
 
+@frozen_arrays
+class PartOfImage(StoredImage):
+    """A part of an image; it is read again each time."""
+
+    image: Picture
+    keep: BoolArray
+    """(h, w) what to keep, at the size of the image or a smaller one."""
+
+    def read(self) -> Image:
+        """Decode the image to (H, W, 3) uint8 RGB."""
+        return without(pixels_of(self.image), self.keep)
+
+
 def without(image: Image, keep: BoolArray) -> Image:
     """The image (H, W, 3) with its mean colour, through a soft edge, outside `keep`.
 

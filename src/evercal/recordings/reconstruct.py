@@ -1,6 +1,7 @@
 """`reconstruct`: camera poses from a plain video or images, by structure from motion (pycolmap).
 
     OUT/images/         chosen frames
+    OUT/mask.png        black where all of them show the same, such as text, if they do
     OUT/database.db     features and matches
     OUT/sparse/0/       the model, read as a COLMAP recording
 
@@ -20,8 +21,10 @@ import numpy as np
 from evercal.classes import frozen
 from evercal.errors import InputError, optional_module
 from evercal.geometry import norms, spread
-from evercal.recordings.images import write_image
+from evercal.recordings.fixed_pixels import COMPARED, LONG_SIDE, fixed_pixels
+from evercal.recordings.images import read_image, write_image
 from evercal.recordings.pictures import is_blank
+from evercal.recordings.repeated_patches import reduced_grey
 from evercal.recordings.streams import StreamFrame, stream
 from evercal.typing import Image, PathLike
 
@@ -81,6 +84,9 @@ def reconstruct(
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = _CAMERA_MODEL
+    mask = _mask(root, names)
+    if mask:
+        reader.camera_mask_path = mask
     on_step("detecting features", 0, 1)
     pycolmap.extract_features(
         root / "database.db",
@@ -134,6 +140,23 @@ def _chosen(source: str, images: Path, motion: float, most: int) -> list[str]:
             " record longer, or move more"
         )
     return keep
+
+
+def _mask(root: Path, names: list[str]) -> Path | None:
+    """A mask of what all images show alike, if there is something: features are not of it."""
+    chosen = [names[i] for i in spread(len(names), COMPARED)]
+    images = [read_image(root / "images" / name) for name in chosen]
+    if len({image.shape for image in images}) > 1:
+        return None
+    fixed = fixed_pixels([reduced_grey(image, LONG_SIDE) for image in images])
+    if not fixed.any():
+        return None
+    keep = np.where(fixed, 0, 255).astype(np.uint8)
+    height, width = images[0].shape[:2]
+    keep = cv2.resize(keep, (width, height), interpolation=cv2.INTER_NEAREST)
+    path = root / "mask.png"
+    write_image(path, np.repeat(keep[..., None], 3, 2))
+    return path
 
 
 def _moving(frames: Iterator[StreamFrame], motion: float) -> Iterator[StreamFrame]:

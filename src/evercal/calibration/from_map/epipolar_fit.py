@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.from_map.image_pairs import ImagePair
-from evercal.geometry import SE3, cross_matrix, spread, unit_vectors
+from evercal.geometry import SE3, cross_matrix, norms, spread, unit_vectors
 from evercal.mapping.bundle_options import BundleOptions
 from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount
 from evercal.typing import Array
@@ -35,6 +35,8 @@ FIRST_PAIRS = 40
 """Maximum number of pairs that first rotations are tried on."""
 FIRST_MATCHES = 10
 """Maximum number of matches of each of these pairs."""
+CLEAR_PARALLAX = np.sin(np.deg2rad(1.0))
+"""Smallest sine of the angle between the rays of a match whose depth has a sign."""
 STEP = 1e-7
 """Step of numerical derivatives, radians and metres."""
 X_SCALE = np.repeat([0.01, 0.1], 3)
@@ -163,6 +165,20 @@ class EpipolarFit:
         distance = np.abs(self.distances(x))
         pairs = range(len(self.pairs))
         return np.array([np.median(distance[self.number == i]) for i in pairs])
+
+    def share_in_front(self, x: Array) -> float:
+        """Share of the matches with parallax whose points lie before the cameras."""
+        camera = self.moving(x[6:]) @ self.transform(x).matrix()
+        between = np.linalg.inv(camera[self.ends[:, 1]]) @ camera[self.ends[:, 0]]
+        between = between[self.number]
+        turned = (between[:, :3, :3] @ self.first[..., None])[..., 0]
+        shift = between[:, :3, 3]
+        # depth * turned + shift is parallel to the ray of the second image.
+        normal = np.cross(turned, self.second)
+        depth_sign = -(np.cross(shift, self.second) * normal).sum(1)
+        sines = norms(normal) / norms(turned) / norms(self.second)
+        clear = sines > CLEAR_PARALLAX
+        return float((depth_sign[clear] > 0).mean()) if clear.any() else 1.0
 
     def transform(
         self,

@@ -206,6 +206,12 @@ def start_from_matches(
             " of frames: check that the poses belong to these images, that they are poses of the"
             " gripper in the base (not the inverse), and the order of their quaternions or angles"
         )
+    if epipolar.share_in_front(best) < 0.5:
+        raise InputError(
+            "the gripper's motion and the images agree only mirrored: all points would lie behind"
+            " the camera. Switch the mirror of the camera off, or convert the poses of a"
+            " left-handed frame"
+        )
     return HandEyeStart(
         epipolar.transform(best),
         mount,

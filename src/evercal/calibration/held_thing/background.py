@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from evercal.calibration.held_thing.moving_parts import MovingPart
 from evercal.recordings.frame import Frame
 from evercal.recordings.images import pixels_of
+from evercal.recordings.masks import PartOfImage
 from evercal.typing import Array, BoolArray, Image
 
 POINTS = 400
@@ -24,8 +24,8 @@ def background_motion(moving: Sequence[Frame]) -> Array:
     NaN where too few points are tracked, or move differently.
     """
     first = moving[0]
-    assert isinstance(first.image, MovingPart), "a frame of moving_parts"
-    motion = motion_of_still([*map(_grey, moving)], ~first.image.moving)
+    assert isinstance(first.image, PartOfImage), "a frame of moving_parts"
+    motion = motion_of_still([*map(_grey, moving)], ~first.image.keep)
     return motion / [first.camera.fx, first.camera.fy]
 
 
@@ -58,6 +58,6 @@ def motion_of_still(greys: Sequence[Image], still: BoolArray) -> Array:
 
 
 def _grey(frame: Frame) -> Image:
-    assert isinstance(frame.image, MovingPart), "a frame of moving_parts"
+    assert isinstance(frame.image, PartOfImage), "a frame of moving_parts"
     grey = cv2.cvtColor(pixels_of(frame.image.image), cv2.COLOR_RGB2GRAY)
     return np.asarray(grey, np.uint8)

@@ -7,9 +7,9 @@ import numpy as np
 
 from evercal.calibration.from_map.hand_eye_start import HandEyeStart, scene_from_parent
 from evercal.calibration.from_map.image_pairs import ImagePair
-from evercal.calibration.held_thing.moving_parts import PATCH_PX
 from evercal.geometry import SE3
 from evercal.recordings.frame import Frame
+from evercal.recordings.repeated_patches import PATCH_PX
 from evercal.robot.mount import EYE_TO_HAND
 from evercal.typing import Array, IntArray
 
