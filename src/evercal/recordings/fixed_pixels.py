@@ -44,12 +44,15 @@ def without_fixed_pixels(recording: Recording) -> tuple[Recording, float]:
     """
     train = list(recording.train)
     most = 0.0
-    for size in {frame.camera.size for frame in train}:
-        rows = [i for i, frame in enumerate(train) if frame.camera.size == size]
-        chosen = [train[rows[i]] for i in spread(len(rows), COMPARED)]
-        fixed = fixed_pixels(
-            [reduced_grey(frame.read_image(), LONG_SIDE) for frame in chosen]
-        )
+    by_size: dict[tuple[int, int], list[int]] = {}
+    for number, frame in enumerate(train):
+        by_size.setdefault(frame.camera.size, []).append(number)
+    for rows in by_size.values():
+        greys = []
+        for i in spread(len(rows), COMPARED):
+            image = train[rows[i]].read_image()
+            greys.append(reduced_grey(image, LONG_SIDE))
+        fixed = fixed_pixels(greys)
         if fixed.any():
             most = max(most, float(fixed.mean()))
             for i in rows:

@@ -144,15 +144,19 @@ def _chosen(source: str, images: Path, motion: float, most: int) -> list[str]:
 
 def _mask(root: Path, names: list[str]) -> Path | None:
     """A mask of what all images show alike, if there is something: features are not of it."""
-    chosen = [names[i] for i in spread(len(names), COMPARED)]
-    images = [read_image(root / "images" / name) for name in chosen]
-    if len({image.shape for image in images}) > 1:
+    greys = []
+    sizes = set()
+    for number in spread(len(names), COMPARED):
+        image = read_image(root / "images" / names[number])
+        greys.append(reduced_grey(image, LONG_SIDE))
+        sizes.add(image.shape[:2])
+    if len(sizes) > 1:
         return None
-    fixed = fixed_pixels([reduced_grey(image, LONG_SIDE) for image in images])
+    fixed = fixed_pixels(greys)
     if not fixed.any():
         return None
     keep = np.where(fixed, 0, 255).astype(np.uint8)
-    height, width = images[0].shape[:2]
+    [(height, width)] = sizes
     keep = cv2.resize(keep, (width, height), interpolation=cv2.INTER_NEAREST)
     path = root / "mask.png"
     write_image(path, np.repeat(keep[..., None], 3, 2))
