@@ -1,8 +1,8 @@
 """Cameras of simulators, projected by the formulas of each program."""
 
-import ast
 import re
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -67,7 +67,8 @@ def sapien(text: str, points: Array) -> Array:
     first = numbers(text.partition("sapien.Pose(")[2].splitlines()[0])
     w, x, y, z = first[3:]
     matrix = quaternion_matrix(x, y, z, w, translation=first[:3])
-    fx, fy, cx, cy = numbers(text.partition("set_perspective_parameters(")[2])[2:6]
+    words = text.partition("set_perspective_parameters(")[2].partition(")")[0]
+    fx, fy, cx, cy = eval(f"[{words}]")[2:6]
     forward, left, up = seen_by(matrix, points).T  # x forward, y left, z up
     return np.c_[cx - fx * left / forward, cy - fy * up / forward]
 
@@ -80,10 +81,8 @@ def clipped(points: Array, to_clip: Array) -> Array:
 
 
 def pybullet(text: str, points: Array) -> Array:
-    read = {}
-    for node in ast.parse(text).body:
-        assert isinstance(node, ast.Assign)
-        read[ast.unparse(node.targets[0])] = ast.literal_eval(node.value)
+    read: dict[str, Any] = {}
+    exec(text, read)
     view = np.reshape(read["view_matrix"], (4, 4), order="F")
     projection = np.reshape(read["projection_matrix"], (4, 4), order="F")
     assert (read["width"], read["height"]) == SIZES[-1]
@@ -94,13 +93,13 @@ def pybullet(text: str, points: Array) -> Array:
 
 def blender(text: str, points: Array) -> Array:
     compile(text, "script", "exec")
-    read = dict(re.findall(r"(?:data|render)\.(\w+) = (\S+)", text))
+    read = dict(re.findall(r"(?:data|render)\.(\w+) = (.*)", text))
     matrix = numbers(text.partition("Matrix((")[2].partition("))")[0]).reshape(4, 4)
     across, down = SIZES[-1]
     lens, sensor, right, up = (
-        float(read[name]) for name in ("lens", "sensor_width", "shift_x", "shift_y")
+        eval(read[name]) for name in ("lens", "sensor_width", "shift_x", "shift_y")
     )
-    ratio = float(read["pixel_aspect_x"]) / float(read["pixel_aspect_y"])
+    ratio = eval(read["pixel_aspect_x"]) / eval(read["pixel_aspect_y"])
     fx = lens / sensor * across
     centre = np.array([across / 2 - right * across, down / 2 + up * across * ratio])
     return pinhole(seen_by(matrix, points), np.array([fx, fx * ratio]), centre)

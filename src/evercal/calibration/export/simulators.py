@@ -8,8 +8,7 @@ along -z with y up. All of them count pixels from the corner of the image, half 
 import re
 from collections.abc import Callable
 from functools import partial
-
-import numpy as np
+from operator import methodcaller
 
 from evercal.calibration.export.request import (
     Export,
@@ -17,17 +16,13 @@ from evercal.calibration.export.request import (
     standard_link_from_optical,
 )
 from evercal.errors import InputError
-from evercal.geometry import Camera
-from evercal.typing import JsonObject
+from evercal.recordings.poses.conventions import OPENGL_FROM_OPENCV
 
-_NEAR_M = 0.01
-_FAR_M = 100.0
-_SENSOR_MM = 36.0
 _LARGEST_OFFSET_PX = 0.5
 _SQUARE = 1e-3
 _MUJOCO = """<!-- {comment} Put it into the body of {parent}. -->
 <camera name="{name}" pos="{} {} {}" quat="{} {} {} {}"
-        resolution="{width} {height}" sensorsize="{sensor_x} {sensor_y}"
+        resolution="{width} {height}" sensorsize="{width}e-5 {height}e-5"
         focalpixel="{fx} {fy}" principalpixel="{left} {up}"/>
 """
 _ISAAC = """#usda 1.0
@@ -40,11 +35,11 @@ _ISAAC = """#usda 1.0
 # Isaac Lab: OffsetCfg(pos, rot, convention="opengl") of the same matrix, transposed.
 def Camera "{name}"
 {{
-    float2 clippingRange = ({near}, {far})
-    float focalLength = {lens}
-    float horizontalAperture = {sensor_x}
-    float verticalAperture = {sensor_y}
-    float horizontalApertureOffset = {offset_x}
+    float2 clippingRange = (0.01, 100)
+    float focalLength = {fx}
+    float horizontalAperture = {width}
+    float verticalAperture = {aperture_y}
+    float horizontalApertureOffset = {left}
     float verticalApertureOffset = {offset_y}
     matrix4d xformOp:transform = (
         ({}, {}, {}, {}),
@@ -63,9 +58,11 @@ import sapien
 
 def add_camera(scene, mount):
     camera = scene.add_mounted_camera(
-        "{name}", mount, {parent_}_from_camera, {width}, {height}, 1.0, {near}, {far}
+        "{name}", mount, {parent_}_from_camera, {width}, {height}, 1.0, 0.01, 100.0
     )
-    camera.set_perspective_parameters({near}, {far}, {fx}, {fy}, {edge_x}, {edge_y}, 0.0)
+    camera.set_perspective_parameters(
+        0.01, 100.0, {fx}, {fy}, {cx} + 0.5, {cy} + 0.5, 0.0
+    )
     return camera
 """
 _PYBULLET = """# {comment} By column, for {parent} at the origin of the world.
@@ -78,11 +75,13 @@ view_matrix = [
     {}, {}, {}, {},
     {}, {}, {}, {},
 ]
+near = 0.01
+far = 100.0
 projection_matrix = [
-    {sx}, 0.0, 0.0, 0.0,
-    0.0, {sy}, 0.0, 0.0,
-    {ox}, {oy}, {depth}, -1.0,
-    0.0, 0.0, {depth_0}, 0.0,
+    2 * {fx} / width, 0.0, 0.0, 0.0,
+    0.0, 2 * {fy} / height, 0.0, 0.0,
+    2 * {left} / width, -2 * {up} / height, (far + near) / (near - far), -1.0,
+    0.0, 0.0, 2 * far * near / (near - far), 0.0,
 ]
 # pybullet.getCameraImage(width, height, view_matrix, projection_matrix)
 """
@@ -92,10 +91,10 @@ from mathutils import Matrix
 
 data = bpy.data.cameras.new("{name}")
 data.sensor_fit = "HORIZONTAL"
-data.sensor_width = {sensor_x}
-data.lens = {lens}
-data.shift_x = {shift_x}
-data.shift_y = {shift_y}
+data.sensor_width = 36.0
+data.lens = 36.0 * {fx} / {width}
+data.shift_x = {left} / {width}
+data.shift_y = {offset_y} / {width}
 camera = bpy.data.objects.new("{name}", data)
 bpy.context.scene.collection.objects.link(camera)
 camera.matrix_world = Matrix((
@@ -109,28 +108,16 @@ render = bpy.context.scene.render
 render.resolution_x = {width}
 render.resolution_y = {height}
 render.resolution_percentage = 100
-render.pixel_aspect_x = {aspect_x}
-render.pixel_aspect_y = {aspect_y}
+render.pixel_aspect_x = max(1.0, {fy} / {fx})
+render.pixel_aspect_y = max(1.0, {fx} / {fy})
 """
 
 
-def _by_row(export: Export) -> list[float]:
-    return export.numbers("matrix:opengl")
-
-
-def _quaternion(export: Export) -> list[float]:
-    return export.numbers("wxyz:opengl")
-
-
-def _by_column(export: Export) -> list[float]:
-    matrix = np.reshape(export.numbers("matrix:opengl"), (4, 4))
-    return matrix.T.ravel().tolist()
-
-
-def _view(export: Export) -> list[float]:
-    """The inverse by column."""
-    matrix = np.reshape(export.numbers("matrix:opengl"), (4, 4))
-    return (np.linalg.inv(matrix).T.ravel() + 0.0).tolist()
+def _by_column(export: Export, inverse: bool = False) -> list[float]:
+    matrix = export.pose @ OPENGL_FROM_OPENCV
+    if inverse:
+        matrix = matrix.inverse()
+    return (matrix.matrix().T.ravel() + 0.0).tolist()
 
 
 def _link(export: Export) -> list[float]:
@@ -147,69 +134,42 @@ def _write(
         raise InputError(
             "a simulator draws no fisheye; give a pinhole camera for undistorted images with `lens`"
         )
-    optics = _optics(camera)
+    left = (camera.width - 1) / 2 - camera.cx
+    up = (camera.height - 1) / 2 - camera.cy
+    ratio = camera.fx / camera.fy
     if camera.distortion:
         export.notes.append(
             "the simulator draws images without distortion; undistort those of the camera before"
             " you compare them"
         )
-    far = max(abs(optics["left"]), abs(optics["up"])) > _LARGEST_OFFSET_PX
-    if template == _ISAAC and (far or abs(camera.fx / camera.fy - 1) > _SQUARE):
+    apart = max(abs(left), abs(up)) > _LARGEST_OFFSET_PX or abs(ratio - 1) > _SQUARE
+    if apart and template == _ISAAC:
         export.notes.append(
             f"Isaac's renderer may take the mean of fx {camera.fx:.1f} and fy {camera.fy:.1f}, and"
-            f" the middle of the image ({optics['left']:.1f}, {optics['up']:.1f} px away)"
+            f" the middle of the image ({left:.1f}, {up:.1f} px away)"
         )
-    names = {
-        "name": re.sub(r"\W", "_", export.child),
-        "parent": export.parent,
-        "parent_": re.sub(r"\W", "_", export.parent),
-        "comment": re.sub("-(?=-)", "- ", export.comment),
-    }
     export.stated[:] = numbers(export)
-    return template.format(*map(repr, export.stated), **names, **optics)
-
-
-def _optics(camera: Camera) -> JsonObject:
-    """What the templates state of a camera."""
-    width = camera.width
-    height = camera.height
-    left = (width - 1) / 2 - camera.cx
-    up = (height - 1) / 2 - camera.cy
-    lens = camera.fx * _SENSOR_MM / width
-    ratio = camera.fx / camera.fy
-    return {
+    return template.format(
+        *map(repr, export.stated),
         **vars(camera),
-        "left": left,
-        "up": up,
-        "lens": lens,
-        "sensor_x": _SENSOR_MM,
-        "sensor_y": lens * height / camera.fy,
-        "offset_x": lens * left / camera.fx,
-        "offset_y": -lens * up / camera.fy,
-        "shift_x": left / width,
-        "shift_y": -up * ratio / width,
-        "aspect_x": max(1.0, 1 / ratio),
-        "aspect_y": max(1.0, ratio),
-        "edge_x": camera.cx + 0.5,
-        "edge_y": camera.cy + 0.5,
-        "sx": 2 * camera.fx / width,
-        "sy": 2 * camera.fy / height,
-        "ox": 2 * left / width,
-        "oy": -2 * up / height,
-        "near": _NEAR_M,
-        "far": _FAR_M,
-        "depth": -(_FAR_M + _NEAR_M) / (_FAR_M - _NEAR_M),
-        "depth_0": -2 * _FAR_M * _NEAR_M / (_FAR_M - _NEAR_M),
-    }
+        name=re.sub(r"\W", "_", export.child),
+        parent=export.parent,
+        parent_=re.sub(r"\W", "_", export.parent),
+        comment=re.sub("-(?=-)", "- ", export.comment),
+        left=left,
+        up=up,
+        aperture_y=camera.height * ratio,
+        offset_y=-up * ratio,
+    )
 
 
-mujoco = partial(_write, _MUJOCO, _quaternion)
+mujoco = partial(_write, _MUJOCO, methodcaller("numbers", "wxyz:opengl"))
 """An MJCF camera; MuJoCo counts its principal point from there to the middle."""
 isaac = partial(_write, _ISAAC, _by_column)
 """A USD camera; its matrix is for rows, and its offsets are to the right and up."""
 sapien = partial(_write, _SAPIEN, _link)
 """The pose and the camera in Python, for ManiSkill as well."""
-pybullet = partial(_write, _PYBULLET, _view)
+pybullet = partial(_write, _PYBULLET, partial(_by_column, inverse=True))
 """The two matrices of getCameraImage, by column."""
-blender = partial(_write, _BLENDER, _by_row)
+blender = partial(_write, _BLENDER, methodcaller("numbers", "matrix:opengl"))
 """A script that adds the camera and sets the size of images."""
