@@ -158,6 +158,7 @@ tangential distortion coefficient y: 0.00001
 metric radius: 1.7
 """
 MRCAL = """\
+# generated on 2026-01-02 03:04:05 with   mrcal-calibrate-cameras --lensmodel LENSMODEL_OPENCV5
 {
     'lensmodel':  'LENSMODEL_OPENCV5',
 

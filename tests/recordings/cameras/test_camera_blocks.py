@@ -120,6 +120,12 @@ RIGHT_INPUT = (
     {"roi": {"x_offset": 0, "y_offset": 0, "width": 640, "height": 480}, "D": [0] * 5},
     {"lens": {"k1": 0.0, "k2": 0.0}, "lensPosition": 130, "serial": "0123"},
     {"stereo": {"baseline": 0.12, "R": np.eye(3).tolist()}, "depth_scale": 0.001},
+    {
+        "base_from_camera": {"xyz": [0.1, 0, 1], "rpy": [0, 1, 0]},
+        "T_cam_imu": [0.1] * 7,
+    },
+    {"robot": {"dof": 6, "home": [0.1] * 6}, "gripper": {"width_m": 0.08}, "seed": 3},
+    {"optimal_camera_matrix": np.eye(3).tolist(), "ret": 0.3, "rvecs": [[1, 2, 3]]},
     {"P1": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "new_camera_matrix": MATRIX},
 )
 
@@ -135,9 +141,17 @@ SEVERAL = {
     "left and right": {"mtx_l": MATRIX, "dist_l": D, "mtx_r": RIGHT, "dist_r": [0] * 5},
     "cameras": {"cameras": [{"name": "wrist", "K": MATRIX, "D": D}, {"K": RIGHT}]},
     "lists beside": {"left": {"K": MATRIX}, "right": {"K": RIGHT}, "left_D": D},
+    "beside a block": {"K": MATRIX, "D": D, "rear": {"K": RIGHT, "D": [0] * 5}},
+    "rectified": {"K_raw": MATRIX, "D_raw": D, "K_rect": RIGHT, "rms": 0.2},
+    "numbers": {
+        **{f"{key}_left": value for key, value in (PLAIN | DIST).items()},
+        **{f"{key}_right": 600.0 for key in ("fx", "fy")},
+        "cx_right": 320,
+        "cy_right": 240,
+    },
     "numbered": {"cam0_K": MATRIX, "cam0_D": D, "cam1_K": RIGHT, "cam1_D": D},
 }
-FIRST = ("M1", "mtx_l", "wrist", "left", "cam0")
+FIRST = ("M1", "mtx_l", "wrist", "left", "K D", "K_raw", "fx_left", "cam0")
 
 
 @pytest.mark.parametrize(("name", "word"), [*zip(SEVERAL, FIRST, strict=True)])
@@ -147,7 +161,7 @@ def test_one_of_several_cameras_is_named(tmp_path: Path, name: str, word: str) -
         rf"holds 2 cameras: .*{word}.* \(640x480, fx 525\.0\)", read_camera, file, SIZE
     )
     assert read_camera(f"{file}:{word}", SIZE) == CAMERA
-    refused("no camera 'rear', only", read_camera, f"{file}:rear", SIZE)
+    refused("no camera 'nowhere', only", read_camera, f"{file}:nowhere", SIZE)
 
 
 def test_stereo_cameras_are_named_by_their_keys(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Camera files of SDKs and programs: texts of many notations give the same camera."""
 
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -215,6 +216,20 @@ def test_matlab_counts_from_one(tmp_path: Path) -> None:
     refused(
         r"MATLAB's pixels start at \(1, 1\)", read_camera, tmp_path / "c.mat", IMAGES
     )
+
+
+def test_long_texts_cost_little(tmp_path: Path) -> None:
+    blank = " " * 100_000
+    began = time.process_time()
+    for text in (
+        f"a{blank}b\n[{'a' * 100_000}\n]",
+        f"[1{',' * 100_000}]",
+        f"a{blank}: 1\n",
+    ):
+        refused("give|limits", read_camera, written(tmp_path, text), IMAGES)
+    frames = {f"{i:06d}": {**PLAIN, "pose": [0.1] * 16} for i in range(3000)}
+    refused("holds 3000 cameras", read_camera, written(tmp_path, json.dumps(frames)))
+    assert time.process_time() - began < 10
 
 
 def test_an_attribute_does_not_hide_a_number(tmp_path: Path) -> None:

@@ -182,11 +182,11 @@ TWELVE = [
         b"sequence0 [frames=9]",
         r"split\.txt: 9 test frames, but .* has 5 images",
     ),
-    ("info.txt", b"m_colorWidth = 128", r"info\.txt: needs m_colorWidth"),
+    ("info.txt", b"m_colorWidth = 128", r"info\.txt: 'camera_matrix' is missing"),
     (
         "info.txt",
         INFO.replace("116 0 65.5", "wide").encode(),
-        r"info\.txt: needs m_colorWidth",
+        r"info\.txt: 'camera_matrix' is missing",
     ),
     (
         "data/frame-000002.pose.txt",

@@ -43,6 +43,9 @@ _SHORT = {"m": "camera_matrix", "s": "image_size"}
 """Fields by names that mean them only beside a word such as `1` or `left`."""
 
 
+_MOST_CAMERAS = 500
+
+
 class _Value(NamedTuple):
     path: str
     """Names that lead to it, with points between them."""
@@ -60,11 +63,24 @@ def cameras_of(data: object) -> dict[str, JsonObject]:
     homes: dict[Any, list[_Value]] = {}
     for value in values:
         homes.setdefault(value.home, []).append(value)
-    for is_camera in (_has_matrix, _has_view):
-        cameras = {home: own for home, own in homes.items() if is_camera(own)}
-        if cameras:
-            return dict(_fields(home, cameras, values) for home in cameras)
-    return {}
+    cameras = {}
+    views = {}
+    for home, own in homes.items():
+        fields = {value.field: value.value for value in own}
+        if "fx" in fields or is_array(fields.get("camera_matrix")):
+            cameras[home] = own
+        elif has_view(fields):
+            views[home] = own
+    cameras = cameras or views
+    if len(cameras) > _MOST_CAMERAS:
+        raise ValueError(f"holds {len(cameras)} cameras; give a file of the right one")
+    told = [own[0].words for own in cameras.values()]
+    loose: list[tuple[_Value, bool]] = []
+    for value in values:
+        if value.home not in cameras:
+            loose.append((value, any(map(value.words.issubset, told))))
+    alone = len(cameras) == 1
+    return dict(_fields(home, own, loose, alone) for home, own in cameras.items())
 
 
 def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
@@ -92,7 +108,6 @@ def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
                 name = entry.get("name") or entry.get("class") or name
             if isinstance(entry, dict) or (sizes and isinstance(entry, list)):
                 parts[f"{path}[{name}]"] = entry
-        parts.pop(f"{path}[initial]", None)  # of Metashape, before its adjustment
     if not parts:
         yield path, value
     for name, entry in parts.items():
@@ -130,20 +145,10 @@ def _told(words: Iterable[str]) -> frozenset[str]:
     return frozenset({_SAME.get(word, word) for word in lower - _NEUTRAL})
 
 
-def _has_matrix(values: list[_Value]) -> bool:
-    own = {value.field: value.value for value in values}
-    return "fx" in own or is_array(own.get("camera_matrix"))
-
-
-def _has_view(values: list[_Value]) -> bool:
-    return has_view({value.field: value.value for value in values})
-
-
 def _fields(
-    home: Any, cameras: dict[Any, list[_Value]], values: list[_Value]
+    home: Any, own: list[_Value], loose: list[tuple[_Value, bool]], alone: bool
 ) -> tuple[str, JsonObject]:
-    """Name and fields of one camera."""
-    own = cameras[home]
+    """Name and fields of one camera; `loose` are values outside of cameras, and if one has them."""
     told = own[0].words
     fields: JsonObject = {}
     for value in own:
@@ -152,23 +157,21 @@ def _fields(
     hidden = {*_OF_ONE_CAMERA, *(value.field for value in own)}
     if not hidden.isdisjoint(DISTORTION):
         hidden.update(DISTORTION)
-    for value in values:
+    for value, is_taken in loose:
         block = value.home[0]
         is_lens = value.field in DISTORTION or value.field in MODEL_NAMES
         beside = block not in home[0]
-        if value.home in cameras:
-            continue
         sure = value.words <= told and (value.field in FIELDS or is_lens or not beside)
-        others = any(value.words <= other[0].words for other in cameras.values())
-        if others and not value.words <= told:
+        if is_taken and not value.words <= told:
             continue
         if value.field in hidden and not (beside and is_lens):
             continue
         if fields.get(value.field) == value.value:
             continue
-        if beside and is_lens and len(cameras) > 1 and not value.words:
+        if beside and is_lens and not (alone or value.words):
             sure = False
         name = value.field if sure and value.field not in hidden else value.path
         fields[name] = value.value
     names = [value.path for value in own if value.field in (*_OF_ARRAYS[:2], "fx")]
-    return " ".join(names) if home[1] else home[0], fields
+    named = " ".join(names) or "camera"
+    return named if home[1] or not home[0] else home[0], fields

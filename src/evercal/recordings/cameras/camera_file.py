@@ -94,9 +94,9 @@ def camera_from_fields(
     fitting: dict[Camera, str] = {}
     for place in places:
         entry = entries[place]
-        with naming(place) if place else nullcontext():
+        with naming(place) if len(entries) > 1 else nullcontext():
             camera = camera_of(entry, size)
-        cameras[place or "outside of these"] = camera
+        cameras[place] = camera
         if camera.size == size and (states_size(entry) or is_central(camera)):
             fitting[camera] = place
     choice = fitting or {camera: place for place, camera in cameras.items()}

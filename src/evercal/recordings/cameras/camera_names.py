@@ -64,9 +64,10 @@ _HARMLESS = re.compile(
     r"|index|baseline|depth|range|temp|apert(?!ureoffset)|expos|gain|fov|angle|focal|aspect|mm$|rotation|trans"
     r"|^[rt]vec|quat|extrin|pose|position|orient|imu|noise|^rgb$|track|^bf$|^new|imagescale"
     r"|overlap|^d[wh]$|perframe|center|radius|score|neighbor|^t\d|region|icam|stereo|thdepth"
-    r"|orbextract|viewer|system|accel|gyro|bias|walk|mocap|vignette|batch|unit|housing|rect|corner"
-    r"|^t$|^pos|^rot|euler|axes|axis|focus|fstop|near|far|clip|socket|firmware|port|seed|quality|channels|bits|buffer|cost"
+    r"|orbextract|viewer|system|accel|gyro|bias|walk|mocap|vignette|batch|unit|housing|^[rsp]rect|rectific|corner"
+    r"|^t$|^pos|^rot$|euler|axes|axis|focus|fstop|near|far|clip|socket|firmware|port|seed|quality|channels|bits|buffer|cost"
     r"|weight|speed|robot|joint|gripper|world|origin|name|^step|^bounds|limit|threshold|light|ambient|bright|white"
+    r"|from|xyz|rpy|hand|tool|flange|mount|initial|optimal|^ret|^fw|^t[a-z]*(cam|imu|base|body)|^tbs$"
 )
 """Names of numbers that do not change where a point lies in the image."""
 LENS = re.compile(

@@ -21,8 +21,8 @@ EXPECTED = (
 )
 """What a camera file may hold, for messages."""
 _COMMENT = re.compile(r"(^|\s)[#;].*")
-_SECTION = re.compile(r"\[([^\[\]]*[A-Za-z][^\[\]]*)\]")
-_PAIR = re.compile(r"([A-Za-z_][^:=]*?)\s*[:=]+\s*(.*)")
+_SECTION = re.compile(r"\[([^\[\]]+)\]")
+_PAIR = re.compile(r"([A-Za-z_][^:=]*)[:=]+\s*(.*)")
 _NEXT_PAIR = re.compile(r"[,;]\s*(?=[A-Za-z_][\w .]*[:=])")
 _NAMED_NUMBERS = re.compile(r"([A-Za-z_]\w*)((?:[\s,]+[-+.\d][-+.\deE]*)+)")
 _BRACKETS = str.maketrans("", "", "[](){}<>,;\"'")
@@ -39,7 +39,8 @@ _COLMAP = re.compile(
 
 def entries_of(text: str) -> JsonObject:
     """Nested entries of a text in one of the notations; ValueError for other text."""
-    start = text.lstrip()[:1]
+    body = re.sub(r"\A(\s*#.*\n)+", "", text)
+    start = body.lstrip()[:1]
     if start == "<":
         return _of_xml(text)
     rows = [row.groupdict() for row in _REALSENSE.finditer(text)]
@@ -53,7 +54,7 @@ def entries_of(text: str) -> JsonObject:
     problem = ""
     try:
         # A printed message ends with '---', which opens a second, empty document.
-        data, *_ = [*documents(text, start == "{"), None]
+        data, *_ = [*documents(body, start == "{"), None]
         if start == "[" and isinstance(data, list):
             data = {"cameras": data}
         if isinstance(data, dict):
@@ -66,7 +67,7 @@ def entries_of(text: str) -> JsonObject:
         problem = f"{problem[:14]} ({line[0]})" if line else problem[:14]
     if start == "{":
         with suppress(ValueError, SyntaxError):
-            data = ast.literal_eval(text.strip())
+            data = ast.literal_eval(body.strip())
             if isinstance(data, dict):
                 return data
     data = {} if start == "{" else _of_lines(text)
@@ -100,7 +101,7 @@ def _of_lines(text: str) -> JsonObject:
     key = ""
     for raw in text.splitlines():
         line = _COMMENT.sub("", raw).strip()
-        titled = _SECTION.fullmatch(line)
+        titled = isinstance(value_of(line), str) and _SECTION.fullmatch(line)
         named = _NAMED_NUMBERS.fullmatch(line) or _PAIR.fullmatch(line)
         if not line:
             continue
@@ -109,10 +110,10 @@ def _of_lines(text: str) -> JsonObject:
         elif named and named[2]:
             for part in _NEXT_PAIR.split(line):
                 pair = _NAMED_NUMBERS.fullmatch(part) or _PAIR.fullmatch(part)
-                if not pair or pair[1] in block:
+                key = pair[1].strip() if pair else ""
+                if not pair or key in block:
                     return {}
                 holder = block
-                key = pair[1]
                 block[key] = value_of(pair[2])
         elif isinstance(value_of(line), str):
             key = line.rstrip(": ")
@@ -151,8 +152,10 @@ def _xml_value(element: Any) -> Any:
     entry: JsonObject = {}
     for name, words in element.attrib.items():
         entry[name] = value_of(words)
-    for tag in dict.fromkeys(child.tag for child in children):
-        values = [*map(_xml_value, element.findall(tag))]
+    groups: dict[str, list[Any]] = {}
+    for child in children:
+        groups.setdefault(child.tag, []).append(_xml_value(child))
+    for tag, values in groups.items():
         entry[tag] = values[0] if len(values) == 1 else values
     words = (element.text or "").strip()
     if not entry:

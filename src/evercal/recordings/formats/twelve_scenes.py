@@ -10,12 +10,13 @@ from pathlib import Path
 
 from evercal.errors import InputError
 from evercal.geometry import Camera
+from evercal.recordings.cameras.camera_file import camera_from_fields, fields_of
 from evercal.recordings.formats.seven_scenes import colour_images
 from evercal.recordings.formats.tracked_frames import tracked_recording
 from evercal.recordings.frame import Recording
 from evercal.recordings.images import first_size
 from evercal.recordings.read_options import ReadOptions
-from evercal.storage.text_files import library_errors, read_text
+from evercal.storage.text_files import named_errors, read_text
 
 
 def detect(root: Path) -> bool:
@@ -53,14 +54,6 @@ def _test_count(root: Path, frames: int) -> int:
 
 def _camera(root: Path, images: list[Path]) -> Camera:
     file = root / "info.txt"
-    text = read_text(file, "calibration", "it holds m_calibrationColorIntrinsic")
-    values = {}
-    for line in text.splitlines():
-        name, _, value = line.partition("=")
-        values[name.strip()] = value.split()
-    keys = ("m_colorWidth", "m_colorHeight", "m_calibrationColorIntrinsic")
-    with library_errors(f"{file}: needs {', '.join(keys)}"):
-        width, height, matrix = map(values.__getitem__, keys)
-        fx, _, cx, _, _, fy, cy, *_ = map(float, matrix)
-        camera = Camera(int(*width), int(*height), fx, fy, cx, cy)
+    with named_errors(file, "calibration", "it holds m_calibrationColorIntrinsic"):
+        camera = camera_from_fields(fields_of(file), None, "color")
     return camera.resized(*first_size(images))
