@@ -301,10 +301,8 @@ def summary(report: "LearnReport", file: Path) -> Iterator[str]:
             few = f"{report.landmarks / report.frames_kept:.0f} landmarks a keyframe are few"
             yield f"warning: {few}: most images will be refused; record sharper and textured views"
     if report.fixed_share:
-        yield (
-            f"{100 * report.fixed_share:.1f} % of the image shows the same in all images, such as"
-            " text or the gripper: left out"
-        )
+        share = f"{100 * report.fixed_share:.1f} % of the image shows the same in all images"
+        yield f"{share}, such as text or the gripper: left out"
     for other in report.same_place:
         if other.same_base:
             yield other.agreement

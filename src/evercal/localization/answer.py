@@ -18,8 +18,14 @@ REQUIRED_SUPPORT = -math.log10(acceptance.FALSE_ACCEPTS)
 """Support of an accepted pose."""
 
 
-def rejection(hypothesis: Hypothesis, scene: SceneMap) -> str:
-    """Why a pose is not accepted."""
+def rejection(
+    hypothesis: Hypothesis | None, scene: SceneMap, mirrored: float = 0.0
+) -> str:
+    """Why a pose is not accepted; `mirrored` is the support of the mirror image."""
+    if mirrored > REQUIRED_SUPPORT:
+        return _mirrored_reason(hypothesis.support if hypothesis else 0.0, mirrored)
+    if not hypothesis:
+        return "fewer than 6 inliers"
     share = f"{100 * hypothesis.inlier_ratio:.0f} %"
     return (
         f"{hypothesis.inliers} inliers, {share} of the landmarks of {scene.name} that should be"
@@ -90,10 +96,7 @@ def answer(
     `size` are height and width of the image; `mirrored` is the support of its mirror image.
     """
     if not best:
-        reason = "fewer than 6 inliers"
-        if mirrored > REQUIRED_SUPPORT:
-            reason = _mirrored_reason(0.0, mirrored)
-        return PoseEstimate.failed(reason, milliseconds)
+        return PoseEstimate.failed(rejection(None, scene, mirrored), milliseconds)
     rejected = PoseEstimate(
         status="unknown_scene",
         reason="",
@@ -106,10 +109,7 @@ def answer(
         support=best.support,
     )
     if not accepted(best):
-        reason = rejection(best, scene)
-        if mirrored > REQUIRED_SUPPORT:
-            reason = _mirrored_reason(best.support, mirrored)
-        return replace(rejected, reason=reason)
+        return replace(rejected, reason=rejection(best, scene, mirrored))
     misfit = _misfit(best)
     estimate, terms = in_base(best, scene, misfit)
     rejected = replace(rejected, parent_frame=scene.parent_frame, base=scene.base)

@@ -305,6 +305,12 @@ class BundleAdjustment:
         weight = student_weights(errors, sigma, self.options.tail)
         return Variances(sigma, weight, variances.shared)
 
+    def _focal_changes(self, tracks: BundleTracks, estimate: Estimate) -> Array:
+        linearised = estimate.linearised
+        cameras = self.frames.cameras(estimate.parameters)
+        noise = noise_of(linearised) * self.options.correlation
+        return focal_changes(tracks, linearised, cameras, noise)
+
     def _result(
         self,
         tracks: BundleTracks,
@@ -316,9 +322,7 @@ class BundleAdjustment:
         linearised = estimate.linearised
         residual = np.linalg.solve(tracks.whitening, linearised.residual[..., None])
         residual_px = norms(residual[linearised.valid, :, 0])
-        cameras = None
-        if self.adjusts_camera:
-            cameras = self.frames.cameras(parameters)
+        cameras = self.frames.cameras(parameters) if self.adjusts_camera else None
         root = estimate.root
         by_pose = [root[:, 6 * i : 6 * i + 6] for i in range(n)]
         shared = root[:, 6 * n :]
@@ -360,12 +364,7 @@ class BundleAdjustment:
             weight=np.minimum(variances.weight, 1.0),
             covariance=np.stack([columns.T @ columns for columns in by_pose]),
             inverse_depth=parameters.inverse_depth,
-            focal_changes=focal_changes(
-                tracks,
-                linearised,
-                self.frames.cameras(parameters),
-                noise_of(linearised) * self.options.correlation,
-            ),
+            focal_changes=self._focal_changes(tracks, estimate),
             offsets=parameters.shared[joints],
             offsets_covariance=offsets + systematic[joints, joints],
             offsets_prior=np.sqrt(prior),
