@@ -338,3 +338,13 @@ def test_another_dictionary_that_fits_is_named() -> None:
     with pytest.raises(InputError, match=f"give `dictionary` {TAG.dictionary}"):
         find_boards(list(images), images.__getitem__, other)
     assert other_dictionary(list(images.values()), TAG) == ""
+
+
+@pytest.mark.parametrize("board", [CHARUCO, TAG, APRILGRID, ARUCOGRID])
+def test_mirrored_images_of_markers_are_named(board: Board) -> None:
+    images = {}
+    for i in range(4):
+        image = photographed(board, view_of(board, i))
+        images[str(i)] = np.ascontiguousarray(image[:, ::-1])
+    with pytest.raises(InputError, match="switch the mirror of the camera off"):
+        find_boards(list(images), images.__getitem__, board)

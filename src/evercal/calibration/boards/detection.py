@@ -14,6 +14,7 @@ from evercal.calibration.boards.markers import (
     find_charuco,
     find_markers,
     grid_views,
+    mirrored_hint,
     other_dictionary,
     sizes_pooled,
 )
@@ -91,11 +92,26 @@ def find_boards(
             if reason and any(isinstance(view, OtherBoard) for view in views.values()):
                 raise InputError(reason)
             if reason:
-                images = [read(names[k]) for k in order[:_HINT_IMAGES]]
-                shown = [image for image in images if not isinstance(image, str)]
+                shown = _readable(read, [names[k] for k in order[:_HINT_IMAGES]])
                 raise InputError(reason + other_dictionary(shown, board))
+            if last and board.gap_m and _few_markers(views, board):
+                shown = _readable(read, [names[k] for k in order[:_HINT_IMAGES]])
+                hint = mirrored_hint(shown, board)
+                if hint:
+                    raise InputError(hint)
     ordered = {name: found.views[name] for name in names}
     return found._replace(views=ordered)
+
+
+def _readable(read: Callable[[str], Image | str], names: Sequence[str]) -> list[Image]:
+    images = map(read, names)
+    return [image for image in images if not isinstance(image, str)]
+
+
+def _few_markers(views: Mapping[str, Detection], board: Board) -> bool:
+    """Whether most images show less than half of a grid: some markers decode in mirror images."""
+    shown = [len(v.pixels) for v in views.values() if isinstance(v, BoardView)]
+    return bool(np.median(shown) < 2 * board.columns * board.rows)
 
 
 def _markers(looked: Mapping[str, Detection | Markers]) -> dict[str, Markers]:

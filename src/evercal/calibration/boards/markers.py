@@ -49,26 +49,48 @@ def sizes_pooled(views: Mapping[str, Detection]) -> dict[str, Detection]:
 
 
 def other_dictionary(images: Sequence[Image], board: Board) -> str:
-    """Return a hint at the dictionary whose markers most images show, if it is not the stated one.
+    """Return a hint at another dictionary whose markers most images show, or at mirrored images.
 
     `images` are (H, W, 3).
     """
     if board.kind == "chessboard":
         return ""
+    hint = mirrored_hint(images, board)
+    if hint:
+        return f"; {hint}"
     best = board.dictionary
     most = 0
     for name in dictionaries():
-        detector = cv2.aruco.ArucoDetector(
-            dictionary_of(replace(board, dictionary=name))
-        )
-        found = [detector.detectMarkers(image)[1] for image in images]
-        counts = [0 if ids is None else len(ids) for ids in found]
-        if np.median(counts) >= 1 and sum(counts) > most:
+        count = _visible(images, replace(board, dictionary=name))
+        if count > most:
             best = name
-            most = sum(counts)
+            most = count
     if best == board.dictionary:
         return ""
     return f"; markers of {best} are visible: give `dictionary` {best}"
+
+
+def mirrored_hint(images: Sequence[Image], board: Board) -> str:
+    """What to do where mirror images show more markers than images (H, W, 3); empty elsewhere."""
+    more = 0
+    for image in images:
+        grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+        mirror = np.ascontiguousarray(grey[:, ::-1])
+        upright, mirrored = (len(find_markers(g, board).ids) for g in (grey, mirror))
+        more += mirrored > 2 * upright
+    if 2 * more <= len(images):
+        return ""
+    return "its markers are visible in the mirror image: switch the mirror of the camera off"
+
+
+def _visible(images: Sequence[Image], board: Board) -> int:
+    """Number of markers of the board's dictionary, if most images show one."""
+    detector = cv2.aruco.ArucoDetector(dictionary_of(board))
+    counts = []
+    for image in images:
+        ids = detector.detectMarkers(image)[1]
+        counts.append(0 if ids is None else len(ids))
+    return sum(counts) if np.median(counts) >= 1 else 0
 
 
 def find_markers(grey: Image, board: Board) -> Markers:
