@@ -249,3 +249,77 @@ def test_another_size_is_said_to_be_a_resize_or_a_cut(tmp_path: Path) -> None:
     message = r"is 640x480 \(squeezed or cut out from 1280x720\?\)"
     refused(message, check_size, "c.json", wide, IMAGES, "a.png")
     assert FLAT
+
+
+WIDTH = {"width": 640, "height": 480}
+VIEWS = {
+    "mujoco": ('<camera name="a" pos="0 0 1" quat="1 0 0 0" fovy="45"/>', 579.41, 319.5, 239.5),
+    "mujoco, sensor": (
+        '<camera resolution="640 480" sensorsize="6.4e-3 4.8e-3" focal="5e-3 5e-3"/>',
+        500.0, 319.5, 239.5,
+    ),
+    "isaac": ({"focal_length": 24, "horizontal_aperture": 20.955, **WIDTH}, 733.0, 319.5, 239.5),
+    "blender": (
+        {"lens": 35, "sensor_width": 36, "shift_x": 0.05, "shift_y": 0.03, **WIDTH},
+        622.22, 287.5, 258.7,
+    ),
+    "blender, upright": (
+        {"lens": 35, "sensor_width": 36, "resolution_x": 480, "resolution_y": 640},
+        622.22, 239.5, 319.5,
+    ),
+    "blender, vertical": (
+        {"lens": 35, "sensor_width": 36, "sensor_height": 24, "sensor_fit": "VERTICAL", **WIDTH},
+        700.0, 319.5, 239.5,
+    ),
+    "gazebo": (
+        "<camera><horizontal_fov>1.047</horizontal_fov><image><width>640</width>"
+        "<height>480</height></image><clip><near>0.02</near></clip></camera>",
+        554.38, 319.5, 239.5,
+    ),
+    "habitat": ({"hfov": 90, **WIDTH}, 320.0, 319.5, 239.5),
+    "maniskill": ({"uid": "hand", "fov": 1.5708, "width": 128, "height": 128}, 64.0, 63.5, 63.5),
+    "nerf": ({"camera_angle_x": 0.69}, 890.44, 319.5, 239.5),
+    "both": ({"fovx": 60, "fovy": 46.826, **WIDTH}, 554.26, 319.5, 239.5),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_fields_of_view_of_simulators_are_read(tmp_path: Path, name: str) -> None:
+    content, focal, cx, cy = VIEWS[name]
+    text = content if isinstance(content, str) else json.dumps(content)
+    size = None if "width" in text and name != "maniskill" else IMAGES
+    camera = read_camera(written(tmp_path, text), size)
+    assert (camera.cx, camera.cy) == (pytest.approx(cx), pytest.approx(cy))
+    assert (camera.fx, camera.fy) == (pytest.approx(focal, abs=0.01),) * 2
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"fov": 60, **WIDTH}, "'fov' 60 may be that of the width or of the height"),
+        ({"fovy": 0, **WIDTH}, "the field of view, or the sensor, has no size"),
+        ({"fovy": "wide", **WIDTH}, "fov_y is a number, got 'wide'"),
+        ({"lens": 35, "sensor_width": 0, **WIDTH}, "the sensor, has no size"),
+        (
+            {"lens": 35, "sensor_width": 36, "sensor_fit": "VERTICAL", **WIDTH},
+            "has no size",
+        ),
+        (
+            {"focal_length": [1, 2, 3], "horizontal_aperture": 20, **WIDTH},
+            "focal is a number",
+        ),
+        (
+            {
+                "focal_length": 24,
+                "horizontal_aperture": 21,
+                "horizontal_aperture_offset": 0.5,
+            },
+            "'horizontal_aperture_offset' is not known",
+        ),
+        ({"fovy": 45, "distortion_k": 0.2}, "'distortion_k' is not known"),
+    ],
+)
+def test_broken_fields_of_view_are_refused(
+    tmp_path: Path, fields: dict[str, object], message: str
+) -> None:
+    refused(message, read_camera, written(tmp_path, json.dumps(fields)), IMAGES)

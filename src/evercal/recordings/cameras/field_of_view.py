@@ -7,7 +7,6 @@ image of a simulator is cut about its middle, so its principal point is at (widt
 """
 
 import math
-from typing import Any
 
 from evercal.recordings.poses.row_files import by_alias
 from evercal.typing import JsonObject, Pair, Record, Size
@@ -29,6 +28,8 @@ b1: b1
 _SETS = ("fov_y", "fov_x", "fov", "focalpixel", "focal aperture", "focal cx cy")
 """Fields that make a camera, any of these sets."""
 _LARGEST_RADIANS = 3.2
+_FROM_CORNER = 0.25
+"""Share of the image beyond which a principal point is counted from the corner."""
 
 
 def _view(fields: Record) -> JsonObject:
@@ -53,34 +54,36 @@ def pixels_of_view(fields: Record, size: Size) -> JsonObject:
         raise ValueError(
             f"'fov' {view['fov']} may be that of the width or of the height; name it fovx or fovy"
         )
-    focal = _pair(view.get("focal", 1.0))
-    wide, high = 0.0, 0.0
+    focal = _pair(view, "focal", 1.0)
+    wide, high = _pair(view, "aperture")
     across = width
-    if "focalpixel" in fields or ("cx" in fields and "aperture" not in view):
-        wide, high = width, height / float(view.get("aspect", 1))
+    if "focalpixel" in fields or ("cx" in fields and not wide):
+        wide, high = width, height / _pair(view, "aspect", 1.0)[0]
     elif "lens" in fields:
         # Blender's sensor is as wide as the longer side.
         fit = str(fields.get("sensorfit", "AUTO"))
         across = {"HORIZONTAL": width, "VERTICAL": height}.get(fit, max(size))
-        wide = float(view["aperture_y" if fit == "VERTICAL" else "aperture"])
+        if fit == "VERTICAL":
+            wide, _ = _pair(view, "aperture_y")
         wide *= width / across
-    elif "aperture" in view and "focal" in view:
-        wide, high = _pair(view["aperture"])
-        if not isinstance(view["aperture"], list):
-            high = float(view.get("aperture_y", 0))
-    else:
-        wide = 2 * _tangent(view.get("fov_x", 0))
-        high = 2 * _tangent(view.get("fov_y", view.get("fov", 0)))
+        high = 0.0
+    elif not wide:
+        wide = 2 * _tangent(_pair(view, "fov_x"))
+        high = 2 * _tangent(_pair(view, "fov_y" if "fov_y" in view else "fov"))
+    elif not isinstance(view["aperture"], list):
+        high, _ = _pair(view, "aperture_y")
     wide = wide or high * width / height
     high = high or wide * height / width
+    if not wide * high > 0:
+        raise ValueError("the field of view, or the sensor, has no size")
     fx = focal[0] / wide * width
     fy = focal[1] / high * height
-    right, down = _pair(view.get("centre", 0))
-    cx = (width - 1) / 2 - right - float(view.get("shift_x", 0)) * across
-    cy = (height - 1) / 2 - down + float(view.get("shift_y", 0)) * across
+    right, down = _pair(view, "centre")
+    cx = (width - 1) / 2 - right - _pair(view, "shift_x")[0] * across
+    cy = (height - 1) / 2 - down + _pair(view, "shift_y")[0] * across
     pixels = {**fields, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
-    stated = [float(fields.get(name, 0)) for name in ("cx", "cy", "p2", "p1", "b1")]
-    if max(abs(stated[0] / width), abs(stated[1] / height)) > 0.25:
+    stated = [_pair(view, name)[0] for name in ("cx", "cy", "p2", "p1", "b1")]
+    if max(abs(stated[0] / width), abs(stated[1] / height)) > _FROM_CORNER:
         pixels |= {"cx": stated[0], "cy": stated[1]}
     elif "cx" in fields:
         # Metashape: from the middle; its tangential terms are in the other order.
@@ -89,14 +92,18 @@ def pixels_of_view(fields: Record, size: Size) -> JsonObject:
     return pixels
 
 
-def _pair(value: Any) -> Pair:
+def _pair(view: Record, name: str, default: float = 0.0) -> Pair:
     """Two numbers, or one for both axes."""
-    x, y = value if isinstance(value, list) else (value, value)
-    return float(x), float(y)
+    value = view.get(name, default)
+    try:
+        x, y = value if isinstance(value, list) else (value, value)
+        return float(x), float(y)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is a number, got {value!r}") from None
 
 
-def _tangent(angle: Any) -> float:
-    angle = float(angle)
+def _tangent(angles: Pair) -> float:
+    angle = angles[0]
     if angle >= _LARGEST_RADIANS:
         angle = math.radians(angle)
     return math.tan(angle / 2)
