@@ -298,6 +298,7 @@ def test_fields_of_view_of_simulators_are_read(tmp_path: Path, name: str) -> Non
     [
         ({"fov": 60, **WIDTH}, "'fov' 60 may be that of the width or of the height"),
         ({"fovy": 0, **WIDTH}, "the field of view, or the sensor, has no size"),
+        ({**RADTAN, "aspect_ratio": 0, **WIDTH}, "fx, fy.*got 0"),
         ({"fovy": "wide", **WIDTH}, "fov_y is a number, got 'wide'"),
         ({"lens": 35, "sensor_width": 0, **WIDTH}, "the sensor, has no size"),
         (

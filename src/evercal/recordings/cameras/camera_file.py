@@ -82,7 +82,7 @@ def camera_from_fields(
     """
     entries = cameras_of(data)
     if not entries:
-        return camera_of(data, size)
+        return camera_of({str(key): value for key, value in data.items()}, size)
     places = [*entries]
     if name:
         exact = [place for place in places if place == name]

@@ -50,6 +50,8 @@ def pixels_of_view(fields: Record, size: Size) -> JsonObject:
     """
     view = _view(fields)
     width, height = size
+    if min(size) < 1:
+        raise ValueError(f"the image size is width and height in pixels, got {size}")
     if "fov" in view and width != height and {"fov_x", "fov_y"}.isdisjoint(view):
         raise ValueError(
             f"'fov' {view['fov']} may be that of the width or of the height; name it fovx or fovy"
@@ -58,7 +60,8 @@ def pixels_of_view(fields: Record, size: Size) -> JsonObject:
     wide, high = _pair(view, "aperture")
     across = width
     if "focalpixel" in fields or ("cx" in fields and not wide):
-        wide, high = width, height / _pair(view, "aspect", 1.0)[0]
+        wide, high = size
+        focal = focal[0], focal[1] * _pair(view, "aspect", 1.0)[0]
     elif "lens" in fields:
         # Blender's sensor is as wide as the longer side.
         fit = str(fields.get("sensorfit", "AUTO"))
