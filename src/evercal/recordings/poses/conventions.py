@@ -22,12 +22,19 @@ from scipy.spatial.transform import Rotation
 from evercal.classes import frozen
 from evercal.geometry import SE3, norms, rotation_error
 from evercal.recordings.poses.row_files import by_alias
-from evercal.typing import Array, BoolArray, JsonObject
+from evercal.typing import Array, BoolArray, JsonObject, Strings
 
 _TOLERANCE = 1e-2
 """Error of a quaternion's length, or of R^T R, if printed with three digits."""
 OPENGL_FROM_OPENCV = SE3(np.array([0.0, 1.0, 0.0, 0.0]), np.zeros(3))
 """Rotation between the camera axes of OpenGL and OpenCV; its own inverse."""
+CAMERA_AXES = {
+    "opengl": OPENGL_FROM_OPENCV,
+    "x_forward": SE3(np.array([0.5, -0.5, 0.5, -0.5]), np.zeros(3)),
+    "x_left": SE3(np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)),
+}
+"""Rotation from OpenCV's camera axes to others, by modifier: OpenGL's; x forward, y left, z up
+(SAPIEN, Isaac's world axes, ROS bodies); x left, y up, z forward (PyTorch3D, CoppeliaSim)."""
 
 
 @frozen
@@ -44,6 +51,8 @@ class PoseConvention:
     """Length of a unit of the position."""
     degrees: bool = False
     """Whether angles are in degrees, else radians."""
+    columns: Strings = ()
+    """Columns of a table without a header, if the caller states them."""
 
     @property
     def base(self) -> str:
@@ -73,6 +82,20 @@ class PoseConvention:
         """Whether the name has one of these modifiers."""
         return not set(modifiers).isdisjoint(self.name.split(":")[1:])
 
+    @property
+    def camera_axes(self) -> SE3 | None:
+        """Rotation from OpenCV's camera axes to those of the poses, if they are others."""
+        for modifier, axes in CAMERA_AXES.items():
+            if self.has(modifier):
+                return axes
+        return None
+
+    @property
+    def tag(self) -> str:
+        """Number of the tag whose poses are meant; empty if the name has none."""
+        words = self.name.split(":tag")[1:]
+        return words[0].partition(":")[0] if words else ""
+
 
 Given = PoseConvention | None
 """The convention that the caller states, if any."""
@@ -97,6 +120,8 @@ def asking_for(option: str | None) -> Iterator[None]:
         raise ValueError(f"{error.problem}; give {option} {error.remedy}") from None
 
 
+OF_COLUMNS = "columns"
+"""Name of a convention that the stated columns of a table define."""
 _CONVENTIONS = (
     PoseConvention("wxyz", "wxyz", "x y z qw qx qy qz, metres"),
     PoseConvention("xyzw", "xyzw", "x y z qx qy qz qw, metres, as ROS"),
@@ -116,6 +141,7 @@ _CONVENTIONS = (
         "kawasaki", "ZYZ", "X Y Z O A T, mm, degrees, about z y z", 0.001, True
     ),
     PoseConvention("matrix", "rows", "4x4 or 3x4 matrix row after row, metres"),
+    PoseConvention(OF_COLUMNS, "", "what the columns define"),
     PoseConvention("franka", "columns", "matrix column after column, metres (O_T_EE)"),
 )
 CONVENTIONS = {convention.name: convention for convention in _CONVENTIONS}
@@ -128,9 +154,9 @@ ur: universal_robots
 yaskawa: motoman
 """)
 """Further vendors and the convention, with its units, that each uses."""
-KNOWN_CONVENTIONS = (
-    f"{', '.join([*CONVENTIONS, *VENDORS])}, fixed_xyz or moving_zyx with any order of axes,"
-    f" followed by :m, :mm, :rad, :deg, :inverse or :opengl where needed"
+_KNOWN = (
+    "such as xyzw, ur, rpy, kuka or matrix, or the columns themselves, such as"
+    " x,y,z,qw,qx,qy,qz (docs/formats.md#pose-files lists all)"
 )
 for _letters in product("xyz", repeat=3):
     _axes = "".join(_letters)
@@ -151,21 +177,32 @@ UNITS: dict[str, JsonObject] = {
 
 
 def pose_convention(name: str) -> PoseConvention:
-    """Parse the name of a convention with modifiers, such as `kuka:m:inverse`."""
+    """Parse the name of a convention with modifiers, such as `kuka:m:inverse`.
+
+    The columns of a table without a header may come first: `a,b,c,x,y,z:kuka`. If they define the
+    convention, they are enough: `qw,qx,qy,qz,x,y,z,...:inverse`. Dots are further columns.
+    """
     base, *modifiers = name.strip().lower().split(":")
+    columns = ()
+    if "," in base:
+        columns = tuple(map(str.strip, base.split(",")))
+        base = OF_COLUMNS
+        if {*CONVENTIONS, *VENDORS}.intersection(modifiers[:1]):
+            base = modifiers.pop(0)
     base = VENDORS.get(base, base)
     if base not in CONVENTIONS:
         problem = f"pose convention {name!r} is not known"
         for nearest in get_close_matches(base, [*CONVENTIONS, *VENDORS], 1):
             problem += f", {nearest} is"
-        raise ConventionError(problem, f"NAME, one of {KNOWN_CONVENTIONS}")
-    convention = replace(CONVENTIONS[base], name=":".join([base, *modifiers]))
-    kinds = [("m", "mm"), ("inverse",), ("opengl",)]
+        raise ConventionError(problem, f"NAME, {_KNOWN}")
+    name = ":".join([base, *modifiers])
+    convention = replace(CONVENTIONS[base], name=name, columns=columns)
+    kinds = [("m", "mm"), ("inverse",), tuple(CAMERA_AXES)]
     if convention.has_angles:
         kinds.insert(1, ("rad", "deg"))
     known = [*chain(*kinds)]
     for modifier in modifiers:
-        if modifier not in known:
+        if modifier not in known and not re.fullmatch(r"tag\d+", modifier):
             raise ValueError(
                 f"pose convention {name!r}: {modifier!r} is not one of {', '.join(known)}"
             )
@@ -184,7 +221,7 @@ def poses_from_numbers(
     """Convert numbers (..., k), k of `convention.counts`, to poses (...).
 
     Poses are in metres with OpenCV's camera axes, not inverted. The camera's frame is the second of
-    the pose, or the first with `camera_from` (camera_from_board); only `:opengl` depends on it.
+    the pose, or the first with `camera_from` (camera_from_board); only camera axes depend on it.
     ValueError: numbers are no pose; the message names the first of them.
     """
     numbers = np.asarray(numbers, float)
@@ -203,11 +240,12 @@ def poses_from_numbers(
         poses = SE3(quaternion, numbers[..., :3] * convention.metres_per_unit)
     if convention.has("inverse"):
         poses = poses.inverse()
-    if not convention.has("opengl"):
+    axes = convention.camera_axes
+    if not axes:
         return poses
     if camera_from:
-        return OPENGL_FROM_OPENCV @ poses
-    return poses @ OPENGL_FROM_OPENCV
+        return axes.inverse() @ poses
+    return poses @ axes
 
 
 def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
@@ -215,8 +253,9 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
 
     Quaternions get w >= 0. In gimbal lock the third angle is 0.
     """
-    if convention.has("opengl"):
-        poses = poses @ OPENGL_FROM_OPENCV
+    axes = convention.camera_axes
+    if axes:
+        poses = poses @ axes.inverse()
     if convention.has("inverse"):
         poses = poses.inverse()
     translation = poses.translation_m / convention.metres_per_unit
@@ -238,8 +277,8 @@ def numbers_from_poses(poses: SE3, convention: PoseConvention) -> Array:
     return np.concatenate([translation, numbers], axis=-1)
 
 
-def matrix_convention(numbers: Array) -> PoseConvention:
-    """`matrix` or `franka`, whichever makes rigid transforms of (n, 12 or 16) numbers."""
+def matrix_convention(numbers: Array) -> Given:
+    """`matrix` or `franka`, whichever makes rigid transforms of (n, 12 or 16) numbers, if any."""
     in_rows = _rigid(matrices_from_numbers(numbers, "rows")).all()
     in_columns = _rigid(matrices_from_numbers(numbers, "columns")).all()
     width = numbers.shape[-1]
@@ -253,9 +292,11 @@ def matrix_convention(numbers: Array) -> PoseConvention:
             f"{problem} columns, or rotations in rows before x y z",
             "franka (column after column), or a header r11,r12,r13,r21,r22,r23,r31,r32,r33,x,y,z",
         )
-    orders = "both orders" if in_rows else "no order"
+    if not in_rows:
+        return None
     raise ConventionError(
-        f"{problem} {orders}", "matrix (row after row) or franka (column after column)"
+        f"{problem} both orders",
+        "matrix (row after row) or franka (column after column)",
     )
 
 

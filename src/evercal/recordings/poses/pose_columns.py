@@ -1,11 +1,11 @@
-"""Which columns of a table hold a pose: by their names, or by their number.
+"""Which columns of a table hold a pose, by their names.
 
-Columns with names define a convention, or leave it open between several, such as angles. Rows
-without names have the numbers of a convention, optionally after a stamp.
+Columns with names define a convention, or leave it open between several, such as angles.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain, product
 from typing import NamedTuple
 
@@ -13,24 +13,24 @@ import numpy as np
 
 from evercal.bounds import require_at_most
 from evercal.recordings.poses.conventions import (
-    KNOWN_CONVENTIONS,
+    OF_COLUMNS,
     UNITS,
     ConventionError,
     Given,
     PoseConvention,
-    matrix_convention,
     pose_convention,
 )
+from evercal.recordings.poses.likely_readings import USUAL, undefined
 from evercal.recordings.poses.row_files import (
     Cells,
     Names,
     cell_numbers,
-    in_unit,
     name_and_unit,
     plain_names,
     row_labels,
 )
 from evercal.robot.frame_names import UNKNOWN, FrameNames
+from evercal.storage.text_files import few
 from evercal.typing import Array
 
 
@@ -59,8 +59,8 @@ class ColumnGroup(NamedTuple):
     """End of the name of each column; after tvec_ and rvec_ also its index."""
     conventions: Sequence[str] = ()
     """Conventions that the columns of a rotation may hold."""
-    ask: str = ""
-    """Conventions to ask for; empty if the columns define the first one."""
+    ask: Sequence[str] = ()
+    """Conventions to offer; empty if the columns define the first one."""
     axes: str = ""
     """Axis of each column, for conventions that order their numbers by axis."""
 
@@ -138,26 +138,24 @@ HEADERS = {
     "matrix from r11": ColumnGroup(_R, _grid("123"), ("matrix",)),
     "W P R": ColumnGroup("", "wpr", ("fanuc",)),
     "O A T": ColumnGroup("", "oat", ("kawasaki",)),
-    "q1 to q4": ColumnGroup(_Q, "1234", _ORDERS, "abb, wxyz or xyzw"),
-    "q0 to q3": ColumnGroup(_Q, "0123", _ORDERS, "wxyz or xyzw"),
+    "q1 to q4": ColumnGroup(_Q, "1234", _ORDERS, ("abb", "wxyz", "xyzw")),
+    "q0 to q3": ColumnGroup(_Q, "0123", _ORDERS, ("wxyz", "xyzw")),
     "angles": ColumnGroup(
         _R,
         "xyz",
         _ANGLES,
-        "ur (rotation vector), yaskawa, staubli, fanuc or rpy",
+        ("ur", "rpy", "yaskawa", "staubli"),
         "xyz",
     ),
     "roll pitch yaw": ColumnGroup(
         "",
         ("roll", "pitch", "yaw"),
         ("rpy", "yaskawa", "staubli", "fanuc", "kuka"),
-        "rpy:rad or rpy:deg",
+        ("rpy:rad", "rpy:deg"),
         "xyz",
     ),
-    "A B C": ColumnGroup(
-        "", "abc", ("kuka",), "kuka (A about z) or mitsubishi (A about x)"
-    ),
-    "U V W": ColumnGroup("", "uvw", ("kuka",), "epson (U about z)"),
+    "A B C": ColumnGroup("", "abc", ("kuka",), ("kuka", "mitsubishi")),
+    "U V W": ColumnGroup("", "uvw", ("kuka",), ("epson",)),
 }
 """Columns of a position and of rotations; definite rotations come first."""
 _INDICES = (
@@ -176,6 +174,11 @@ _INDICES = (
 )
 """Columns that only count."""
 
+POSITIONS = (
+    "are positions only, poses need rotations: add the columns of a quaternion, a rotation vector"
+    " or angles"
+)
+"""What is missing in a table of points."""
 _Groups = dict[str, list[int]]
 """Columns by key of `HEADERS`."""
 
@@ -197,7 +200,17 @@ def named_numbers(words: Sequence[str], rows: Cells, given: Given) -> PoseTable:
     for column in chain.from_iterable(groups.values()):
         free[column] = ""
     names, stamps, others = row_labels(free, rows.T.tolist(), len(rows))
-    convention = given or pose_convention(_defined(groups, words))
+    if not given or given.base == OF_COLUMNS:
+        name, problem, offers = _defined(groups, words)
+        if problem:
+            unknown = {*plain_names([free[i] for i in others])}
+            if groups.keys() == {"position"} and unknown.issubset(_INDICES):
+                problem = f"the columns {', '.join(words)} {POSITIONS}"
+                raise ValueError(problem)
+            raise undefined(problem, offers, partial(named_numbers, words, rows))
+        modifiers = given.name.split(":")[1:] if given else []
+        given = pose_convention(":".join([name, *modifiers]))
+    convention = given
     position = groups.pop("position", [])
     columns: list[int] = []
     for key, group in groups.items():
@@ -239,51 +252,6 @@ def _in_units(
         if not convention.has(*known):
             return replace(convention, **UNITS[unit])
     return convention
-
-
-def plain_numbers(numbers: Array, given: Given, names: Names = None) -> PoseTable:
-    """Matrices (n, 4, 4) or (n, 3, 4), or numbers (n, k) or with stamps (n, 1 + k)."""
-    if numbers.ndim != 2:
-        given = given or pose_convention("matrix")
-        if numbers.shape[1:] not in ((4, 4), (3, 4)) or not given.is_matrix:
-            raise ValueError(
-                f"poses are (n, 4, 4), (n, 3, 4) or (n, k) numbers, got {numbers.shape} for"
-                f" {given.name} ({given.meaning})"
-            )
-        numbers = numbers.reshape(len(numbers), -1)
-    width = numbers.shape[1]
-    if not given and width in (12, 13, 16, 17):
-        given = matrix_convention(numbers[:, width % 4 :])
-    if not given:
-        raise ConventionError(
-            f"{width} columns without a header do not define a pose; write a header such as"
-            f" x,y,z,qw,qx,qy,qz",
-            f"NAME, one of {KNOWN_CONVENTIONS}",
-        )
-    numbers = _with_seconds(numbers, given)
-    width = numbers.shape[1]
-    stamps = None
-    if width - 1 in given.counts:
-        stamps = in_unit(numbers[:, 0])
-        numbers = numbers[:, 1:]
-    # A misplaced number shows in quaternions and matrices, but not in angles.
-    misplaced = stamps is not None and given.has_angles and (np.diff(stamps) < 0).any()
-    if numbers.shape[1] not in given.counts or misplaced:
-        raise ValueError(
-            f"rows have {width} numbers; {given.name} takes {' or '.join(map(str, given.counts))}"
-            f" ({given.meaning}), optionally after a name and a stamp that increases"
-        )
-    return PoseTable(numbers, given, names, stamps)
-
-
-def _with_seconds(numbers: Array, convention: PoseConvention) -> Array:
-    """Numbers with one stamp in place of the seconds and nanoseconds of ROS."""
-    stamps = numbers[:, :2]
-    if numbers.shape[1] - 2 not in convention.counts or (stamps // [4e9, 1e9]).any():
-        return numbers
-    if (stamps % 1).any() or not stamps[:, 0].min() > 1e9:
-        return numbers
-    return np.c_[stamps @ [1, 1e-9], numbers[:, 2:]]
 
 
 def groups_of(words: Sequence[str]) -> _Groups:
@@ -336,8 +304,8 @@ def _matched(names: Sequence[str], words: Sequence[str]) -> _Groups:
     return groups
 
 
-def _defined(groups: _Groups, words: Sequence[str]) -> str:
-    """The convention that columns define."""
+def _defined(groups: _Groups, words: Sequence[str]) -> tuple[str, str, Sequence[str]]:
+    """The convention that columns define, or else why there is none, and what to offer."""
     definite = {}
     unclear = []
     for key, columns in groups.items():
@@ -352,16 +320,14 @@ def _defined(groups: _Groups, words: Sequence[str]) -> str:
         ((key, convention),) = definite.items()
         is_whole = len(groups[key]) in pose_convention(convention).counts
         if "position" in groups or is_whole:
-            return convention
+            return convention, "", ()
     if len(definite) > 1:
         problem = f"the header names {' and '.join(definite)}"
-        raise ConventionError(problem, " or ".join(definite.values()))
+        return "", problem, [*definite.values()]
     if unclear and not definite:
         key = unclear[0]
         columns = ", ".join(np.array(words, object)[groups[key]])
         problem = f"columns {columns} do not define a rotation"
-        raise ConventionError(problem, HEADERS[key].ask)
-    raise ConventionError(
-        f"the columns {', '.join(words)} name no known pose (such as x y z qw qx qy qz)",
-        f"NAME, one of {KNOWN_CONVENTIONS}",
-    )
+        return "", problem, HEADERS[key].ask
+    problem = f"the columns {few(words, most=8)} name no known pose"
+    return "", problem, USUAL

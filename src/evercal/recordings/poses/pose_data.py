@@ -17,6 +17,8 @@ from evercal.recordings.poses.conventions import (
     Given,
     pose_convention,
 )
+from evercal.recordings.poses.messages import DETECTIONS, entries_of_messages
+from evercal.recordings.poses.plain_rows import plain_numbers
 from evercal.recordings.poses.pose_arrays import (
     MATRICES,
     Columns,
@@ -30,7 +32,6 @@ from evercal.recordings.poses.pose_columns import (
     PoseTable,
     has_position,
     named_numbers,
-    plain_numbers,
 )
 from evercal.recordings.poses.row_files import (
     number_array,
@@ -93,6 +94,8 @@ def pose_data(data: Any, given: Given, robot: bool = True) -> PoseTable:
     ValueError: these are no poses, or it is not clear which ones.
     """
     data = _plain(data)
+    if isinstance(data, Mapping) and not DETECTIONS.isdisjoint(data):
+        data = [data]
     if isinstance(data, Mapping):
         return _of_object(data, given, robot)
     kinds = set()
@@ -116,11 +119,7 @@ def pose_data(data: Any, given: Given, robot: bool = True) -> PoseTable:
 
 def _of_objects(entries: list[Any], given: Given, robot: bool) -> PoseTable:
     """Poses of a list of one object for each."""
-    # Messages of /tf.
-    lists = [entry.get("transforms") for entry in entries]
-    if {*map(type, lists)} == {list}:
-        entries = [*chain(*lists)]
-    rows = [*map(_flat, entries)]
+    rows = [*map(_flat, entries_of_messages(entries, given))]
     keys = dict.fromkeys(chain.from_iterable(rows))
     require_at_most(len(keys), "columns", "keys")
     require_at_most(len(keys) * len(rows), "numbers", "values")

@@ -1,6 +1,7 @@
-"""Poses in brackets: robots' own notations, numpy's and Python's lists, as lines of a table.
+"""Poses as robots and programs print them, numpy's and Python's lists, as lines of a table.
 
-Notations are tf2_echo of ROS, RAPID of ABB, LS of FANUC, URScript and KRL of KUKA.
+Notations are tf2_echo of ROS, RAPID of ABB, LS of FANUC, URScript, KRL of KUKA, HALCON's .dat,
+Redwood's .log (Open3D), autolab_core's .tf and prints, and prints of SAPIEN, Pinocchio and Blender.
 """
 
 import re
@@ -9,6 +10,8 @@ from evercal.recordings.poses.conventions import Given, pose_convention
 from evercal.recordings.poses.row_files import is_number
 
 _WORD = r'[^\s\[\](){}=,;:"]'
+_MATRIX = ",".join(f"m{row}{column}" for row in range(4) for column in range(4))
+_ROTATION = "r00,r01,r02,r10,r11,r12,r20,r21,r22"
 _NOTATIONS = {
     "Translation: [": (
         r"(?:At time (\S+)\s+)?- Translation: \[([^\[\]]*)\]\s+- Rotation: in Quaternion[^\[\n]*"
@@ -28,11 +31,53 @@ _NOTATIONS = {
     "{": (
         rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?\{{([^\[\]{{}}]*\bX\s+[-+.\d][^\[\]{{}}]*)\}}()',
         "X,Y,Z,A,B,C",
+        "kuka",
     ),
+    "f 0": (
+        r"()(?m:^)f 0\nr ([^\n]*)\nt ([^\n]*)",
+        "rx_deg,ry_deg,rz_deg,x_m,y_m,z_m",
+        "moving_xyz",
+    ),
+    "f 2": (
+        r"()(?m:^)f 2\nr ([^\n]*)\nt ([^\n]*)",
+        "rx_deg,ry_deg,rz_deg,x_m,y_m,z_m",
+        "fixed_xyz",
+    ),
+    "i i j": (
+        r"(?m:^)()(?:\d+[ \t]+){2}\d+\n((?:\S+[ \t]+\S+[ \t]+\S+[ \t]+\S+(?:\n|\Z)){4})()",
+        _MATRIX,
+    ),
+    "FROM TO": (
+        r"(?m:^)()[A-Za-z]\w*\n[A-Za-z]\w*\n(\S+ \S+ \S+)\n((?:\S+ \S+ \S+(?:\n|\Z)){3})",
+        f"x,y,z,{_ROTATION}",
+    ),
+    "Tra: [": (
+        r"()Tra: \[([^\[\]]*)\]\s+Rot: \[[^Q]*\]\s+Qtn: \[([^\[\]]*)\](?:\s+from \S+ to \S+)?",
+        "x,y,z,qw,qx,qy,qz",
+    ),
+    "RigidTransform(": (
+        r"()RigidTransform\(rotation=np\.array\(([^()]*)\), translation=np\.array\(([^()]*)\)",
+        f"{_ROTATION},x,y,z",
+    ),
+    "Pose(": (
+        r"()\bPose\((?:p=)?\[([^\[\]]*)\],\s*(?:q=)?\[([^\[\]]*)\]\)",
+        "x,y,z,qw,qx,qy,qz",
+    ),
+    "R =": (
+        r"()(?m:^)R =\n((?:[^\n]*\n){3})p =([^\n]*)",
+        f"{_ROTATION},x,y,z",
+    ),
+    "<Matrix 4x4": (r"()<Matrix 4x4 ([^<>]*)>()", _MATRIX),
 }
-"""By how it begins: a pose as a pattern of a name or stamp and two groups, and its columns.
-
-A word is read once, from its start."""
+"""By how it begins: a pose as a pattern of a name or stamp and two groups, its columns, and the
+convention of angles. A word is read once, from its start."""
+_OTHER = {
+    r"(?m)^f (\d+)\nr ": "HALCON's representation type {}; write type 0 by convert_pose_type (Pose,"
+    " 'Rp+T', 'gba', 'point')",
+    r"(?m)^(?!(\d+)[ \t]+\1[ \t])(\d+[ \t]+\d+)[ \t]+\d+\n(?:\S+[ \t]+){3}\S+\n": "motions"
+    " between pairs of fragments, the first {}; give the trajectory",
+}
+"""What a notation is that holds no poses, by pattern."""
 
 _TITLE = re.compile(r"^[^\[\]]*[:=]\s*(?=$|\[\[)")
 """Words before a matrix."""
@@ -51,17 +96,21 @@ def without_brackets(lines: list[str], given: Given) -> tuple[list[str], Given]:
         raise ValueError(
             f"it mixes the brackets {' and '.join(sorted(kinds))}; use one notation"
         )
+    for other, problem in _OTHER.items():
+        match = re.search(other, text)
+        if match and match[1] not in ("0", "2"):
+            raise ValueError(problem.format(match[match.lastindex or 1]))
     if not kinds:
         return _without_lists(lines), given
     (kind,) = kinds
-    pattern, columns = _NOTATIONS[kind]
+    pattern, columns, *convention = _NOTATIONS[kind]
     for line in re.sub(pattern, " ", text).splitlines():
         if _holds_numbers(line):
             raise ValueError(
                 f"{line.strip()[:60]!r} is beside poses in {kind}; use one notation"
             )
-    if not given and kind == "{":
-        given = pose_convention("kuka")
+    if not given and convention:
+        given = pose_convention(convention[0])
     return _rows(re.findall(pattern, text), columns), given
 
 
@@ -81,8 +130,8 @@ def _rows(poses: list[tuple[str, str, str]], columns: str) -> list[str]:
         if columns[0] == "X":
             values = dict(re.findall(r"\b([XYZABCWPR])[\s=]+([^\s,]+)", first))
             row = ",".join(values.get(letter, "") for letter in columns.split(","))
-        elif second:
-            row = f"{first},{second}"
+        elif second or columns == _MATRIX:
+            row = re.sub(r"[\s,;()\[\]]+", ",", f"{first},{second}").strip(",")
         rows.append(row)
     # Labels that are all the same are a type, such as E6POS.
     is_type = len(labels) > 1 and len({*labels}) == 1

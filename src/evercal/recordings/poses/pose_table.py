@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from evercal.recordings.poses.conventions import Given
+from evercal.recordings.poses.plain_rows import plain_numbers
 from evercal.recordings.poses.pose_columns import (
     PoseTable,
     groups_of,
     named_numbers,
-    plain_numbers,
 )
 from evercal.recordings.poses.pose_notations import without_brackets
 from evercal.recordings.poses.row_files import (
@@ -49,6 +49,8 @@ def read_pose_table(text: str, given: Given) -> PoseTable:
         rows = rows[1:]
     if not len(rows):
         raise ValueError("no line of numbers in it")
+    if given and given.columns:
+        return _without_header(rows, given)
     if not has_header:
         last_comment = [line.lstrip("#%/ ") for line in comments[-1:]]
         words = table_cells(last_comment).ravel().tolist()

@@ -18,6 +18,7 @@ from evercal.geometry import SE3
 from evercal.recordings.images import files_in
 from evercal.recordings.poses.array_files import arrays_as_lists
 from evercal.recordings.poses.conventions import (
+    ConventionError,
     Given,
     PoseConvention,
     asking_for,
@@ -49,6 +50,9 @@ POSE_ENDINGS = (
     ".mat",
     ".tum",
     ".txt",
+    ".dat",
+    ".log",
+    ".tf",
 )
 _YAML = re.compile(
     r"(?:\s*#.*\n)*(?:%YAML|---\s*\n|(?:- )?[A-Za-z_]\w*:(?:\s*\n\s*(?:- )?[A-Za-z_]\w*:"
@@ -245,8 +249,8 @@ def _poses(table: PoseTable, camera_from: bool = False) -> SE3:
     with suppress(ValueError):
         if not convention.is_matrix:
             checked_poses(np.roll(table.numbers, 3, axis=-1), convention)
-            problem = ValueError(
-                f"the rotation is before the position; write {convention.meaning}, or a header"
-                f" that names the columns"
-            )
+            words = convention.meaning.partition(",")[0].split()[-7:]
+            columns = ",".join(words[3:] + words[:3])
+            remedy = ":".join([columns, *convention.name.split(":")])
+            problem = ConventionError("the rotation is before the position", remedy)
     raise problem
