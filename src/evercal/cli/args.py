@@ -80,9 +80,10 @@ At = Annotated[
 Poses = Annotated[
     str,
     arg(
-        metavar="original|colour|DIR",
+        metavar="original|colour|PATH",
         help="Poses of 7-Scenes and 12-Scenes: as published; those of the colour camera (7-Scenes);"
-        " or a folder of poses by structure from motion (Brachmann et al., ICCV 2021).",
+        " or a folder of poses by structure from motion (Brachmann et al., ICCV 2021). Of other"
+        " folders of images: the file or folder of the camera's poses.",
     ),
 ]
 Address = Annotated[str | None, shown("ADDRESS")]
@@ -195,6 +196,8 @@ class Reading(Named):
     """The poses of a COLMAP or nerfstudio recording are in metres. Default: their unit is unknown
     until 'evercal align'."""
     poses: Poses = "original"
+    split: Annotated[str | None, shown("N:M")] = None
+    """Test frames of a recording without any: 4:1 for one after every four training frames."""
     every: Number = 1
     """Use every N-th image."""
 

@@ -1,8 +1,12 @@
 """Before a recording is learned: its name, its frames and poses, and the held-out frames."""
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import compress
 from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
 
 from evercal.classes import frozen
 from evercal.errors import InputError
@@ -46,6 +50,20 @@ def split_held_out(frames: Sequence[Frame]) -> HeldOutSplit:
         else:
             train.append(frame)
     return HeldOutSplit(tuple(train), tuple(held_out))
+
+
+def split_again(recording: Recording, split: str) -> Recording:
+    """A recording without test frames, with some: 4:1 for one after every four training frames."""
+    match = re.fullmatch(r"([1-9]\d*):(\d+)", split)
+    if not match or recording.test:
+        raise InputError(
+            f"`split` {split}: give N:M, such as 4:1, for a recording without test frames only"
+        )
+    count = int(match[1])
+    places = np.arange(len(recording.train)) % (count + int(match[2]))
+    train = compress(recording.train, places < count)
+    test = compress(recording.train, places >= count)
+    return replace(recording, train=tuple(train), test=tuple(test))
 
 
 def named_recording(recording: Named, name: str | None, taken: Iterable[str]) -> Named:

@@ -112,7 +112,9 @@ def inspect_recording(recording: Recording) -> Inspection:
                 "all training frames look the same way; are the rotations missing?"
             )
         if shown.usable:
-            warnings += rotation_warnings(train, poses, owner == "camera")
+            warnings += rotation_warnings(
+                train, poses, owner == "camera", recording.convention
+            )
     near = None
     if train and test:
         same_m = SAME_M

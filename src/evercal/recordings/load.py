@@ -12,6 +12,7 @@ from evercal.choices import FormatName
 from evercal.classes import frozen
 from evercal.errors import InputError
 from evercal.recordings.frame import Recording, with_images
+from evercal.recordings.held_out import split_again
 from evercal.recordings.images import files_in
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.frame_names import FrameNames
@@ -30,8 +31,6 @@ class RecordingFormat:
 
     module: str
     """Module of `recordings.formats` with functions `detect` and `load`."""
-    contents: str
-    """Files that identify it, for messages."""
     uses: Strings = ()
     """Fields of `ReadOptions` that its `load` takes, apart from `every`."""
 
@@ -42,30 +41,17 @@ class RecordingFormat:
 
 
 FORMATS: dict[FormatName, RecordingFormat] = {
-    "generic": RecordingFormat("generic", "scene.json"),
-    "7scenes": RecordingFormat(
-        "seven_scenes",
-        "TrainSplit.txt, TestSplit.txt and seq-XX folders",
-        ("poses",),
-    ),
-    "12scenes": RecordingFormat(
-        "twelve_scenes", "info.txt, split.txt and data", ("poses",)
-    ),
-    "cambridge": RecordingFormat(
-        "cambridge", "dataset_train.txt and dataset_test.txt", ("camera",)
-    ),
-    "nerfstudio": RecordingFormat("nerfstudio", "transforms.json", ("metres",)),
-    "colmap": RecordingFormat(
-        "colmap", "sparse/0 with cameras and images", ("metres",)
-    ),
+    "generic": RecordingFormat("generic"),
+    "7scenes": RecordingFormat("seven_scenes", ("poses",)),
+    "12scenes": RecordingFormat("twelve_scenes", ("poses",)),
+    "cambridge": RecordingFormat("cambridge", ("camera",)),
+    "nerfstudio": RecordingFormat("nerfstudio", ("metres",)),
+    "colmap": RecordingFormat("colmap", ("metres",)),
     "wrist": RecordingFormat(
-        "wrist",
-        "images beside base_from_gripper.csv, joints.csv, base_from_camera.csv",
-        ("camera", "urdf", "whole_robot", "pose_convention"),
+        "wrist", ("camera", "urdf", "whole_robot", "pose_convention", "poses")
     ),
     "lerobot": RecordingFormat(
         "lerobot",
-        "meta/info.json",
         (
             "camera",
             "image_topic",
@@ -77,7 +63,6 @@ FORMATS: dict[FormatName, RecordingFormat] = {
     ),
     "rosbag": RecordingFormat(
         "ros_bag",
-        "a .bag or .mcap file or bag folder",
         (
             "camera",
             "image_topic",
@@ -144,10 +129,12 @@ def load_recording(
     """
     root = Path(path)
     options = options or ReadOptions()
+    if not recognised(root) and options.poses not in ("original", "colour"):
+        format = format or "wrist"
     format = format_of(root, format)
     uses = FORMATS[format].uses
     for option in options.given():
-        if option not in ("every", *FRAMES, *uses):
+        if option not in ("every", "split", *FRAMES, *uses):
             users = [key for key, entry in FORMATS.items() if option in entry.uses]
             raise InputError(
                 f"`{option}`: not used by recordings of format {format}, only by"
@@ -160,6 +147,8 @@ def load_recording(
             train = recording.train[:: options.every]
             test = recording.test[:: options.every]
             recording = replace(recording, train=train, test=test)
+        if options.split:
+            recording = split_again(recording, options.split)
         with named_errors(root, "recording"):
             folder = root if root.is_dir() else root.parent
             recording = with_images(recording, folder)
@@ -191,17 +180,19 @@ def format_of(root: Path, stated: FormatName | None = None) -> FormatName:
 
 def _refuse(root: Path) -> NoReturn:
     """Say what a file or folder lacks to be a recording."""
-    what = "a file, not a folder, and no bag"
-    if root.is_dir():
-        what = "no known scene format"
-        inside = [path for path in sorted(root.iterdir()) if recognised(path)]
-        names = " or ".join(map(str, inside[:4]))
-        if len(inside) == 1:
-            names += f", or move what it holds to {root}"
-        if inside:
-            raise InputError(f"{root}: no recording, but it has some; give {names}")
-    known = ", ".join(f"{entry.contents} ({key})" for key, entry in FORMATS.items())
-    raise InputError(f"{root}: {what}; expected {known}")
+    inside = [path for path in sorted(root.glob("*")) if recognised(path)]
+    inside = inside or [path for path in sorted(root.glob("*/*")) if recognised(path)]
+    names = " or ".join(map(str, inside[:4]))
+    if len(inside) == 1:
+        names += f", or move what it holds to {root}"
+    if inside:
+        raise InputError(f"{root}: no recording, but it has some; give {names}")
+    outer = root.resolve().parent
+    if recognised(outer):
+        raise InputError(f"{root}: a part of a recording; give {outer}")
+    from evercal.recordings.near_misses import what_it_lacks
+
+    raise InputError(f"{root}: {what_it_lacks(root)}")
 
 
 vars(load_recording)["check"] = format_of

@@ -36,7 +36,10 @@ class ReadOptions:
     unknown."""
     poses: str = "original"
     """Poses of 7-Scenes and 12-Scenes: original; colour for those of the colour camera of 7-Scenes,
-    whose original ones are of the depth camera; or a folder of those by structure from motion."""
+    whose original ones are of the depth camera; or a folder of those by structure from motion. Of
+    other folders of images, the file or folder of camera poses."""
+    split: str | None = None
+    """Test frames of a recording that has none: 4:1 for one after every four training frames."""
     whole_robot: bool = False
     """Read the values of all joints that the URDF has, as for the arm in the images, instead of
     gripper poses, which are those of the base then."""

@@ -131,7 +131,7 @@ def test_archives_that_are_not_unpacked_are_named(data: Path) -> None:
     shutil.rmtree(chess / "seq-01")
     shutil.rmtree(chess / "seq-05")
     shutil.rmtree(chess / "seq-06")
-    message = r"chess: no known scene format; .* not unpacked: seq-01\.zip, "
+    message = r"chess: no known scene format, no images; .* not unpacked: seq-01\.zip, "
     refused(message, load_recording, chess)
 
 

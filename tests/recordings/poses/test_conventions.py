@@ -154,7 +154,7 @@ def test_quaternions_are_written_with_positive_w() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("euler", "is not known; give the convention NAME, one of wxyz"),
+        ("euler", "is not known; give the convention NAME, such as xyzw"),
         ("kuka:cm", "'cm' is not one of m, mm, rad, deg, inv"),
         ("wxyz:deg", "'deg' is not one of m, mm, inverse, opengl"),
         ("kuka:m:mm", "repeats a modifier"),

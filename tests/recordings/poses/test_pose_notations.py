@@ -145,7 +145,7 @@ def test_notations_may_follow_a_name_or_a_stamp(
         (
             "1 0 0 5 0 2 0 0 0 0 1 0",
             None,
-            "12 numbers are rigid transforms in no order; give --c",
+            "what the 12 columns are .* no usual reading fits",
         ),
         (
             blocks(MATRICES.swapaxes(1, 2)),
@@ -160,7 +160,7 @@ def test_notations_may_follow_a_name_or_a_stamp(
         (
             "[[0.1 0.2 0.3 0.4 0.5 0.6]]",
             None,
-            "6 columns without a header .* give --c NAME",
+            "what the 6 columns are .* give --c ur .rotation vector. or rpy",
         ),
     ],
 )

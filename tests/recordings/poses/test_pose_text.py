@@ -118,7 +118,7 @@ def test_commas_may_be_decimal_beside_other_separators(
 @pytest.mark.parametrize(
     ("text", "given", "problem"),
     [
-        (table(turned("kuka")), "kuka", "the rotation is before the position; write X Y Z A B C"),
+        (table(turned("kuka")), "kuka", "before the position; give .* A,B,C,X,Y,Z:kuka"),
         (table(turned("wxyz")), "wxyz", "the rotation is before the position"),
         (table([[i, *row] for i, row in enumerate(turned("ur:mm"))]), "ur:mm", "before the pos"),
         (table(np.c_[R.reshape(5, 9), T].tolist()), None, "or a header r11,r12,r13"),

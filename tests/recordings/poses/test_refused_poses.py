@@ -16,19 +16,19 @@ REFUSED = [
     (
         "x,y,z,rx,ry,rz\n0.5,0,0,0.1,0.2,0.3",
         None,
-        "give the convention ur .rotation vector., yask",
+        "give the convention ur .rotation vector. or rpy",
     ),
     (
         "x,y,z,roll,pitch,yaw\n0.5,0,0,0.1,0.2,0.3",
         None,
-        "give the convention rpy:rad or rpy:deg",
+        "give the convention rpy:rad",
     ),
     (
         "x,y,z,a,b,c\n500,0,0,10,20,30",
         None,
         "columns a, b, c .* give the convention kuka",
     ),
-    ("x,y,z,q1,q2,q3,q4\n" + Q, None, "give the convention abb, wxyz or xyzw"),
+    ("x,y,z,q1,q2,q3,q4\n" + Q, None, "give the convention wxyz or xyzw"),
     (
         "x,y,z,qw,qx,qy,qz,rvec_x,rvec_y,rvec_z\n" + Q + ",0,0,0",
         None,
@@ -38,7 +38,11 @@ REFUSED = [
     ("x,y,z,u,v\n0,0,0,0,0", "kuka", "columns x, y, z, u, v are none of kuka"),
     ("x,y,z,qw,qx,qy,qz\n" + Q, "kuka", "are none of kuka"),
     ("x,y,z,rx,ry,rz\n500,0,0,10,20,30", "kuka", "none of kuka .X Y Z A B C"),
-    (Q, None, "7 columns without a header"),
+    (
+        Q,
+        None,
+        "no header says what the 7 columns are .*; give the convention xyzw or wxyz",
+    ),
     (Q + ",3,4", "wxyz", "rows have 9 numbers; wxyz takes 7"),
     (Q + "\n1,2", "wxyz", "row 2, column 3: '' is not a finite number"),
     ("x,y,z,qw,qx,qy,qz\n0.5,0.1,0.2,1,0,0", None, "row 1, column 'qz': '' is not"),
@@ -118,7 +122,11 @@ def test_ambiguous_and_broken_tables_are_refused(
 @pytest.mark.parametrize(
     ("data", "given", "message"),
     [
-        ([{"translation_m": [1, 2, 3]}], None, "x_m, y_m, z_m name no known pose"),
+        (
+            [{"translation_m": [1, 2, 3]}],
+            None,
+            "x_m, y_m, z_m are positions only",
+        ),
         (
             [{"translation_m": [1, 2], "quaternion_wxyz": [1, 0, 0, 0]}],
             None,
@@ -146,7 +154,7 @@ def test_ambiguous_and_broken_tables_are_refused(
             "millimetres",
         ),
         ([], None, "a list of objects"),
-        ([1, 2], None, "2 columns without a header"),
+        ([1, 2], None, "no header says what the 2 columns are"),
         ([[1, 2], {"x": 1}], None, "not of both"),
         ("text", None, "a list of objects"),
     ],

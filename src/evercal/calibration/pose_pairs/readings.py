@@ -14,6 +14,7 @@ from evercal.calibration.pose_pairs.pairs import PoseNumbers, PosePairs
 from evercal.calibration.pose_pairs.starts import quick_fit
 from evercal.geometry import SE3, pose_distance
 from evercal.recordings.poses.conventions import (
+    CAMERA_AXES,
     CONVENTIONS,
     OPENGL_FROM_OPENCV,
     pose_convention,
@@ -183,7 +184,7 @@ def _reread(numbers: PoseNumbers) -> list[tuple[list[str], SE3]]:
     """Return the poses by other conventions of the same count and unit, with the shortest names."""
     readings: dict[bytes, tuple[list[str], SE3]] = {}
     used = numbers.convention
-    kept = [word for word in ("inverse", "opengl") if used.has(word)]
+    kept = [word for word in ("inverse", *CAMERA_AXES) if used.has(word)]
     for name, other in CONVENTIONS.items():
         if numbers.numbers.shape[1] not in other.counts or name == "tum":
             continue

@@ -35,9 +35,10 @@ def load(root: Path, options: ReadOptions) -> Recording:
     """Read split files and poses, and the size of one image; no other image is opened."""
     folders: list[Path] = []
     splits: list[list[Path]] = []
+    split = options.split
     for name in _SPLITS:
         images: list[Path] = []
-        for folder in _sequences(root, name):
+        for folder in _sequences(root, name, split):
             if folder in folders:
                 raise InputError(
                     f"{root}: {folder.name} comes twice in {' and '.join(_SPLITS)}; keep one"
@@ -53,10 +54,15 @@ def load(root: Path, options: ReadOptions) -> Recording:
     return tracked_recording(root, root.resolve().name, splits, camera, options.poses)
 
 
-def _sequences(root: Path, split: str) -> list[Path]:
-    file = root / split
+def _sequences(root: Path, name: str, split: str | None) -> list[Path]:
+    file = root / name
+    if split and not file.exists():
+        return sorted(root.glob("seq-*/")) if name == _SPLITS[0] else []
     text = read_text(
-        file, "split file", "write lines like 'sequence1' for the seq-XX folders"
+        file,
+        "split file",
+        "write lines like 'sequence1' for the seq-XX folders, or give `split` 4:1 for a test frame"
+        " after every four",
     )
     folders = []
     for line in filter(None, map(str.strip, text.splitlines())):

@@ -72,7 +72,7 @@ NAMES = "frames.json"
 """File of the names of base, gripper and camera."""
 _CAMERA_POSES = tuple(f"base_from_camera{ending}" for ending in POSE_ENDINGS)
 """Files of camera poses."""
-_ONE_POSE = "base_from_camera.txt"
+ONE_POSE = "base_from_camera.txt"
 """File of camera poses, or of the one pose of a fixed camera."""
 _JOINTS = ("joints.csv", "joints.json")
 """Files of joint angles."""
@@ -96,6 +96,11 @@ def detect(root: Path) -> bool:
 def load(root: Path, options: ReadOptions) -> Recording:
     """Read poses, intrinsics and sizes of images; no image is opened whole."""
     layouts = _layouts(root)
+    if options.poses != "original":
+        poses = Path(options.poses)
+        if not (root / poses).exists():
+            poses = poses.absolute()
+        layouts = [RecordingLayout(str(poses))]
     if not layouts:
         expected = ", ".join(_POSES + _JOINTS + _CAMERA_POSES)
         raise InputError(f"{root}: no gripper poses; expected {expected}")
@@ -122,7 +127,7 @@ def _layouts(root: Path) -> list[RecordingLayout]:
         file = root / name
         if not file.is_file():
             continue
-        is_one_pose = name == _ONE_POSE and len(file.read_bytes().split()) <= 16
+        is_one_pose = name == ONE_POSE and len(file.read_bytes().split()) <= 16
         if not is_one_pose:
             tables.append(RecordingLayout(name))
     if tables:
@@ -170,7 +175,14 @@ def _frames(root: Path, layout: RecordingLayout, options: ReadOptions) -> Record
     if not is_gripper:
         named = FrameNames(named.base, "", named.gripper)
     return Recording(
-        name, tuple(frames), (), lost, notes=notes, arm=rows.arm, frames=named
+        name,
+        tuple(frames),
+        (),
+        lost,
+        notes=notes,
+        arm=rows.arm,
+        frames=named,
+        convention=rows.convention,
     )
 
 
@@ -212,11 +224,27 @@ def urdf_beside(root: Path) -> Path:
 
 def _images(root: Path, folders: Sequence[str]) -> list[Path]:
     for folder in folders:
-        images = files_in(root / folder)
+        images = pictures_in(root / folder)
         if images:
             return images
+    others = image_folders(root)
+    if len(others) == 1:
+        return pictures_in(others[0])
     where = " or in ".join("it" if folder == "." else folder for folder in folders)
     raise InputError(f"{root}: no images ({', '.join(IMAGE_ENDINGS)}) in {where}")
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """Images of a folder, without depth."""
+    images = files_in(folder)
+    return [image for image in images if "depth" not in image.name] or images
+
+
+def image_folders(root: Path) -> list[Path]:
+    """Folders with images in a folder, at any depth, without depth and masks."""
+    files = files_in(root, glob="**/*")
+    folders = sorted({file.parent for file in files})
+    return [folder for folder in folders if folder.name not in ("depth", "masks")]
 
 
 def _cameras(root: Path, file: Path | None, images: Sequence[Path]) -> list[Camera]:

@@ -85,16 +85,12 @@ class PoseConvention:
     @property
     def camera_axes(self) -> SE3 | None:
         """Rotation from OpenCV's camera axes to those of the poses, if they are others."""
-        for modifier, axes in CAMERA_AXES.items():
-            if self.has(modifier):
-                return axes
-        return None
+        return next((CAMERA_AXES[name] for name in CAMERA_AXES if self.has(name)), None)
 
     @property
     def tag(self) -> str:
         """Number of the tag whose poses are meant; empty if the name has none."""
-        words = self.name.split(":tag")[1:]
-        return words[0].partition(":")[0] if words else ""
+        return "".join(re.findall(r":tag(\d+)", self.name))
 
 
 Given = PoseConvention | None
@@ -141,7 +137,6 @@ _CONVENTIONS = (
         "kawasaki", "ZYZ", "X Y Z O A T, mm, degrees, about z y z", 0.001, True
     ),
     PoseConvention("matrix", "rows", "4x4 or 3x4 matrix row after row, metres"),
-    PoseConvention(OF_COLUMNS, "", "what the columns define"),
     PoseConvention("franka", "columns", "matrix column after column, metres (O_T_EE)"),
 )
 CONVENTIONS = {convention.name: convention for convention in _CONVENTIONS}
@@ -190,13 +185,14 @@ def pose_convention(name: str) -> PoseConvention:
         if {*CONVENTIONS, *VENDORS}.intersection(modifiers[:1]):
             base = modifiers.pop(0)
     base = VENDORS.get(base, base)
-    if base not in CONVENTIONS:
+    if base not in CONVENTIONS and not columns:
         problem = f"pose convention {name!r} is not known"
         for nearest in get_close_matches(base, [*CONVENTIONS, *VENDORS], 1):
             problem += f", {nearest} is"
         raise ConventionError(problem, f"NAME, {_KNOWN}")
     name = ":".join([base, *modifiers])
-    convention = replace(CONVENTIONS[base], name=name, columns=columns)
+    stated = CONVENTIONS.get(base, PoseConvention(base, "", "what the columns define"))
+    convention = replace(stated, name=name, columns=columns)
     kinds = [("m", "mm"), ("inverse",), tuple(CAMERA_AXES)]
     if convention.has_angles:
         kinds.insert(1, ("rad", "deg"))

@@ -5,7 +5,8 @@ A reading fits if its rotations are rotations and its units are plausible, as wh
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import Any
 
 from evercal.recordings.poses.conventions import (
     ConventionError,
@@ -13,41 +14,34 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
 )
 from evercal.recordings.poses.pose_units import checked_poses
-
-if TYPE_CHECKING:
-    from evercal.recordings.poses.pose_columns import PoseTable
+from evercal.recordings.poses.row_files import by_alias
 
 USUAL = ("xyzw", "wxyz", "ur", "rpy", "kuka", "yaskawa")
 """Usual conventions, the likeliest first."""
-WITHOUT_HEADER = (
-    *USUAL,
-    "qw,qx,qy,qz,x,y,z",
-    "qw,qx,qy,qz,x,y,z,...",
-    "qx,qy,qz,qw,x,y,z",
-    "qx,qy,qz,qw,x,y,z,...",
-    "x,y,z,qx,qy,qz,qw,...",
-    "stamp,qw,qx,qy,qz,x,y,z",
-    "stamp,qx,qy,qz,qw,x,y,z",
-    "stamp,x,y,z,qx,qy,qz,qw,...",
-)
+_COLUMNS = """
+qw,qx,qy,qz,x,y,z qw,qx,qy,qz,x,y,z,... qx,qy,qz,qw,x,y,z qx,qy,qz,qw,x,y,z,...
+x,y,z,qx,qy,qz,qw,... x,y,z,qw,qx,qy,qz,... stamp,qw,qx,qy,qz,x,y,z stamp,qx,qy,qz,qw,x,y,z
+stamp,x,y,z,qx,qy,qz,qw,... stamp,x,y,z,qw,qx,qy,qz,...
+"""
+WITHOUT_HEADER = (*USUAL, *_COLUMNS.split())
 """The same, and columns of rows without a header."""
 _UNITS = ("", ":m", ":mm", ":deg", ":rad", ":m:rad", ":mm:rad", ":mm:deg")
 """Units that a name implies, or may be followed by."""
-_REMARKS = {
-    "ur": "rotation vector",
-    "kuka": "A about z",
-    "mitsubishi": "A about x",
-    "epson": "U about z",
-    "yaskawa": "fixed axes x y z",
-    "staubli": "moving axes x y z",
-    "rpy": "roll, pitch, yaw",
-    "abb": "q1 is w",
-    "qw,qx,qy,qz,x,y,z": "with :inverse for world to camera, as of hloc and ACE",
-}
-"""What distinguishes a reading, by its name without units and dots."""
+_REMARKS = by_alias("""
+rotation vector: ur
+A about z: kuka
+A about x: mitsubishi
+U about z: epson
+fixed axes x y z: yaskawa
+moving axes x y z: staubli
+roll, pitch, yaw: rpy
+q1 is w: abb
+for world to camera append inverse, as for hloc and ACE: qw,qx,qy,qz,x,y,z qw,qx,qy,qz,x,y,z,...
+""")
+"""What distinguishes a reading, by its name without units."""
 
-Read = Callable[[PoseConvention], "PoseTable"]
-"""Reads numbers in a convention; ValueError if they are not of it."""
+Read = Callable[[PoseConvention], Any]
+"""Reads a `PoseTable` of numbers in a convention; ValueError if they are not of it."""
 
 
 def undefined(
@@ -56,15 +50,15 @@ def undefined(
     """An error that offers the first readings that fit, or says what poses are."""
     offers: list[str] = []
     for name in _fitting(names, read):
-        remark = _REMARKS.get(name.partition(":")[0].removesuffix(",..."))
+        remark = _REMARKS.get(name.partition(":")[0])
         offers.append(f"{name} ({remark})" if remark else name)
         if len(offers) == most:
             break
     if offers:
         return ConventionError(problem, " or ".join(offers))
     return ValueError(
-        f"{problem}, and none of the usual readings fits; write a position and a rotation, such as"
-        f" columns x,y,z,qw,qx,qy,qz"
+        f"{problem}, and no usual reading fits; write a position and a rotation, such as columns"
+        f" x,y,z,qw,qx,qy,qz (joint values belong into joints.csv beside a URDF)"
     )
 
 
@@ -75,7 +69,9 @@ def _fitting(names: Sequence[str], read: Read) -> Iterator[str]:
         for name in names:
             with suppress(ValueError):
                 table = read(pose_convention(name + unit))
-                poses = checked_poses(table.numbers, table.convention)
+                # Without units in its name, its units are checked.
+                implied = replace(table.convention, name=table.convention.base)
+                poses = checked_poses(table.numbers, implied)
                 key = poses.matrix().round(6).tobytes()
                 if key not in known:
                     known.add(key)

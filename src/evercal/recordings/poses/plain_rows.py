@@ -18,7 +18,6 @@ from evercal.recordings.poses.pose_columns import POSITIONS, PoseTable, named_nu
 from evercal.recordings.poses.row_files import (
     Names,
     in_unit,
-    names_images,
     text_cells,
 )
 from evercal.typing import Array
@@ -44,8 +43,8 @@ def plain_numbers(numbers: Array, given: Given, names: Names = None) -> PoseTabl
         if names is not None:
             row = f"{names[0]!r} {row}"
         problem = f"no header says what the {width} columns are (first row: {row})"
-        if width < 5:
-            raise ValueError(f"{problem}; {POSITIONS}")
+        if width in (3, 4):
+            raise ValueError(f"the numbers ({row}, ...) {POSITIONS}")
         raise undefined(
             problem, WITHOUT_HEADER, partial(plain_numbers, numbers, names=names)
         )
@@ -69,7 +68,7 @@ def _under_header(numbers: Array, given: PoseConvention, names: Names) -> PoseTa
     """Numbers (n, k) whose columns the caller states."""
     words = [*given.columns]
     if names is not None:
-        words = [word for word in words if not names_images(word)]
+        words = [word for word in words if word not in ("image", "name", "file")]
     width = numbers.shape[-1]
     if words[-1:] == ["..."]:
         words[-1:] = [""] * (width + 1 - len(words))

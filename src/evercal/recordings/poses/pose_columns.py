@@ -207,6 +207,7 @@ def named_numbers(words: Sequence[str], rows: Cells, given: Given) -> PoseTable:
             if groups.keys() == {"position"} and unknown.issubset(_INDICES):
                 problem = f"the columns {', '.join(words)} {POSITIONS}"
                 raise ValueError(problem)
+            problem += f" (first row: {' '.join(rows[0, :8])})"
             raise undefined(problem, offers, partial(named_numbers, words, rows))
         modifiers = given.name.split(":")[1:] if given else []
         given = pose_convention(":".join([name, *modifiers]))

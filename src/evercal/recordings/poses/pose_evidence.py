@@ -6,7 +6,7 @@ poses rotate equally. Correct gripper poses do so up to one fixed rotation betwe
 camera. Inverted poses rotate about other axes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -15,6 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3, norms, spread
 from evercal.recordings.frame import Frame
+from evercal.recordings.poses.conventions import (
+    OPENGL_FROM_OPENCV,
+    UNITS,
+    Given,
+    numbers_from_poses,
+    pose_convention,
+    poses_from_numbers,
+)
 from evercal.typing import Array, Float32Array
 
 PAIRS = 16
@@ -47,16 +55,17 @@ GRIPPER_AGREE_DEG = 1.0
 """`AGREE_DEG` of grippers: their free fixed rotation lets wrong readings fit better."""
 GRIPPER_BETTER = 2.0
 """`BETTER` of grippers."""
-_GL = Rotation.from_euler("x", 180, degrees=True)
-"""OpenGL's camera axes (right, up, backward) from OpenCV's (right, down, forward)."""
+_ORDERS = ("kuka", "yaskawa", "staubli", "kawasaki", "ur")
+"""Conventions that differ in the order of angles."""
 
 
 def rotation_warnings(
-    frames: Sequence[Frame], poses: SE3, of_camera: bool
+    frames: Sequence[Frame], poses: SE3, of_camera: bool, convention: Given = None
 ) -> list[str]:
     """Describe contradictions between stated rotations and the images, in sentences.
 
-    (n,) frames are in recorded order, (n,) poses base_from_camera or else base_from_gripper.
+    (n,) frames are in recorded order, (n,) poses base_from_camera or else base_from_gripper, read
+    from numbers in a convention.
     """
     pairs, measured = measured_pairs(frames, poses)
     if len(measured) < MIN_PAIRS:
@@ -75,7 +84,8 @@ def rotation_warnings(
         owner = "gripper"
         error_of = _fitted_error_deg  # a fixed rotation to the camera is not known
         better = GRIPPER_BETTER
-    stated, readings = _readings(poses, pairs, of_camera)
+    stated = _between(poses.rotation, pairs)
+    readings = dict(_readings(poses, pairs, of_camera, convention))
     error = error_of(measured, stated)
     errors = {name: error_of(measured, turned) for name, turned in readings.items()}
     improved = min(errors.values()) < error / better
@@ -102,22 +112,37 @@ def rotation_warnings(
 
 
 def _readings(
-    poses: SE3, pairs: NDArray[np.intp], of_camera: bool
-) -> tuple[Array, dict[str, Array]]:
-    """(n, 3) rotation vectors first_from_second of pairs as stated, and in other readings."""
+    poses: SE3, pairs: NDArray[np.intp], of_camera: bool, convention: Given
+) -> Iterator[tuple[str, Array]]:
+    """(n, 3) rotation vectors first_from_second of pairs in other readings, with their names."""
+    for name, other in _other_orders(poses, convention):
+        yield name, _between(other.rotation, pairs)
     stated = _between(poses.rotation, pairs)
     inverse = _between(poses.inverse().rotation, pairs)
-    readings = {}
+    owner = "camera" if of_camera else "gripper"
+    yield f"{owner}_from_base, the inverse (append :inverse)", inverse
     if of_camera:
-        readings["camera_from_base, the inverse"] = inverse
-        readings["with OpenGL's camera axes (right, up, backward)"] = _GL.apply(stated)
-        readings["the inverse with OpenGL's camera axes"] = _GL.apply(inverse)
-    else:
-        readings["gripper_from_base, the inverse"] = inverse
-    swapped = Rotation.from_quat(poses.rotation_wxyz)
-    name = "with angles or quaternions in another order"
-    readings[name] = _between(swapped, pairs)
-    return stated, readings
+        turn = OPENGL_FROM_OPENCV.rotation
+        name = "with OpenGL's camera axes (right, up, backward)"
+        yield f"{name} (append :opengl)", turn.apply(stated)
+        yield f"the inverse {name} (append :inverse:opengl)", turn.apply(inverse)
+
+
+def _other_orders(poses: SE3, convention: Given) -> Iterator[tuple[str, SE3]]:
+    """Poses with their angles or quaternions in another order, by its name."""
+    if not convention or convention.is_matrix:
+        return
+    names = _ORDERS if convention.has_angles else ("wxyz", "xyzw")
+    words = ["m" if convention.metres_per_unit == 1 else "mm"]
+    if convention.has_angles:
+        words.append("deg" if convention.degrees else "rad")
+    words += [word for word in convention.name.split(":")[1:] if word not in UNITS]
+    numbers = numbers_from_poses(poses, convention)
+    for name in names:
+        other = pose_convention(":".join([name, *words]))
+        if other.layout != convention.layout:
+            text = f"in another order, {other.name} ({other.meaning})"
+            yield text, poses_from_numbers(numbers, other)
 
 
 def _between(rotation: Rotation, pairs: NDArray[np.intp]) -> Array:

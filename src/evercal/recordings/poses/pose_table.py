@@ -94,5 +94,8 @@ def _blocks(rows: Array, given: Given) -> Array:
         if not in_columns and not last_rows.any():
             height = 3
     if len(rows) % height:
-        raise ValueError(f"{len(rows)} rows of 4 numbers are no 4x4 or 3x4 matrices")
+        raise ValueError(
+            f"{len(rows)} rows of 4 numbers are no 4x4 or 3x4 matrices, and times with positions"
+            f" lack the rotations of poses"
+        )
     return rows.reshape(-1, height, 4)

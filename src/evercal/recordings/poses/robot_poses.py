@@ -249,8 +249,8 @@ def _poses(table: PoseTable, camera_from: bool = False) -> SE3:
     with suppress(ValueError):
         if not convention.is_matrix:
             checked_poses(np.roll(table.numbers, 3, axis=-1), convention)
-            words = convention.meaning.partition(",")[0].split()[-7:]
+            words = convention.meaning.partition(",")[0].split()
             columns = ",".join(words[3:] + words[:3])
-            remedy = ":".join([columns, *convention.name.split(":")])
+            remedy = f"{columns}:{convention.name}"
             problem = ConventionError("the rotation is before the position", remedy)
     raise problem

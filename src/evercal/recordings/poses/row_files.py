@@ -218,11 +218,6 @@ def plain_names(words: Sequence[str]) -> list[str]:
     return [name_and_unit(word)[0] for word in words]
 
 
-def names_images(word: str) -> bool:
-    """Whether a column of this name holds names of images."""
-    return plain_names([word])[0] in _NAMES
-
-
 def row_labels(
     words: Sequence[str],
     columns: Sequence[Sequence[object]],
