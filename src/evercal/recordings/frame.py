@@ -17,7 +17,6 @@ from evercal.storage.text_files import few
 from evercal.typing import Floats, Image, Strings
 
 if TYPE_CHECKING:
-    from evercal.recordings.poses.conventions import PoseConvention
     from evercal.robot.arm import Arm
 
 MIN_TRAIN_FRAMES = 16
@@ -98,8 +97,8 @@ class Recording:
     """Kinematics that `Frame.joints_rad` are values of, where gripper poses are computed."""
     frames: FrameNames = UNKNOWN
     """Names of the frames of its poses, where they are known."""
-    convention: "PoseConvention | None" = None
-    """Convention of the numbers that its poses were read from, where it may be wrong."""
+    convention: str = ""
+    """Name of the convention of the numbers that its poses were read from, if there are any."""
 
 
 def checked_name(name: str) -> str:

@@ -12,7 +12,6 @@ from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings import Frame, Recording, load_recording, write_image
 from evercal.recordings.inspection import inspect_recording
 from evercal.recordings.poses import pose_evidence
-from evercal.recordings.poses.conventions import pose_convention
 from evercal.recordings.poses.pose_evidence import rotation_warnings
 from evercal.recordings.samples import FOLDER
 
@@ -102,9 +101,7 @@ WRONG: dict[str, tuple[Callable[[SE3], SE3], str]] = {
 def test_wrong_camera_poses_are_reported(bedroom: tuple[Frame, ...], how: str) -> None:
     distort, message = WRONG[how]
     assert rotation_warnings(bedroom, stated(bedroom), True) == []
-    (warning,) = rotation_warnings(
-        bedroom, distort(stated(bedroom)), True, pose_convention("wxyz")
-    )
+    (warning,) = rotation_warnings(bedroom, distort(stated(bedroom)), True, "wxyz")
     assert warning.startswith("the camera rotates differently from the images, by ")
     assert message in warning
 
@@ -116,7 +113,7 @@ def test_wrong_gripper_poses_are_reported(bedroom: tuple[Frame, ...]) -> None:
     assert rotation_warnings(bedroom, gripper @ FLIP, False) == []
     (warning,) = rotation_warnings(bedroom, gripper.inverse(), False)
     assert "they are gripper_from_base, the inverse" in warning
-    given = pose_convention("wxyz")
+    given = "wxyz"
     (warning,) = rotation_warnings(bedroom, reordered(gripper), False, given)
     assert "are in another order, xyzw:m (x y z qx qy qz qw" in warning
     (warning,) = rotation_warnings(bedroom, as_degrees(gripper), False)

@@ -182,7 +182,7 @@ def _frames(root: Path, layout: RecordingLayout, options: ReadOptions) -> Record
         notes=notes,
         arm=rows.arm,
         frames=named,
-        convention=rows.convention,
+        convention=rows.convention.name if rows.convention else "",
     )
 
 

@@ -60,7 +60,7 @@ _ORDERS = ("kuka", "yaskawa", "staubli", "kawasaki", "ur")
 
 
 def rotation_warnings(
-    frames: Sequence[Frame], poses: SE3, of_camera: bool, convention: Given = None
+    frames: Sequence[Frame], poses: SE3, of_camera: bool, convention: str = ""
 ) -> list[str]:
     """Describe contradictions between stated rotations and the images, in sentences.
 
@@ -85,7 +85,8 @@ def rotation_warnings(
         error_of = _fitted_error_deg  # a fixed rotation to the camera is not known
         better = GRIPPER_BETTER
     stated = _between(poses.rotation, pairs)
-    readings = dict(_readings(poses, pairs, of_camera, convention))
+    given = pose_convention(convention) if convention else None
+    readings = dict(_readings(poses, pairs, of_camera, given))
     error = error_of(measured, stated)
     errors = {name: error_of(measured, turned) for name, turned in readings.items()}
     improved = min(errors.values()) < error / better
