@@ -8,8 +8,16 @@ Status = Literal["ok", "uncertain", "ambiguous", "unknown_scene", "failed"]
 """Outcome of locating an image."""
 CameraModel = Literal["pinhole", "fisheye"]
 """Projection of a camera; fisheye is OpenCV's."""
-BoardKind = Literal["chessboard", "charuco", "apriltag", "aprilgrid", "arucogrid"]
-"""Printed board: aprilgrid is Kalibr's, arucogrid OpenCV's GridBoard."""
+BoardKind = Literal[
+    "chessboard",
+    "charuco",
+    "apriltag",
+    "aprilgrid",
+    "arucogrid",
+    "circles",
+    "acircles",
+]
+"""Printed board: aprilgrid is Kalibr's, arucogrid OpenCV's GridBoard; acircles has shifted rows."""
 OnClash = Literal["refuse", "rename", "skip", "replace"]
 """What a merge of maps does with a scene whose name is taken."""
 ArmClass = Literal["industrial", "cobot", "hobby"]

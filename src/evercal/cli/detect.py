@@ -29,6 +29,8 @@ _DICTIONARIES: dict[BoardKind, str] = {
     "apriltag": "APRILTAG_36h11",
     "aprilgrid": "APRILTAG_36h11",
     "arucogrid": "4X4_50",
+    "circles": "",
+    "acircles": "",
 }
 """Dictionaries of markers by default."""
 
@@ -43,15 +45,15 @@ class Detect(args.Verb):
     """
 
     board: BoardKind
-    """Printed board; aprilgrid: Kalibr's, arucogrid: OpenCV's GridBoard."""
+    """Printed board; aprilgrid: Kalibr's, arucogrid: OpenCV's GridBoard, acircles: rows shifted."""
     images: args.OptionalImages = ()
     """Image files of one camera, or a folder of them."""
     size: Annotated[str | None, args.shown("CxR")] = None
-    """Inner corners of a chessboard (9x6), squares of a ChArUco board, or markers of a grid."""
+    """Inner corners of a chessboard (9x6), squares of a ChArUco board, markers or circles."""
     square_mm: Annotated[float | None, args.shown("MM")] = None
-    """Side of a square, or of the black square of a tag or marker, millimetres."""
+    """Side of a square, or of the black square of a tag or marker; from row to row of circles."""
     marker_mm: Annotated[float, args.shown("MM")] = 0.0
-    """Side of a marker of a ChArUco board, millimetres."""
+    """Side of a marker of a ChArUco board, or diameter of a circle of --make-board, millimetres."""
     gap_mm: Annotated[float, args.shown("MM")] = 0.0
     """Distance between two markers of a grid, millimetres."""
     dictionary: Annotated[

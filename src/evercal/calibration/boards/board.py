@@ -9,6 +9,8 @@
 - aprilgrid, arucogrid: the origin is the outer corner of the first marker, x follows its row, y
   the rows, and z is x cross y: towards the camera in Kalibr's print, whose rows go up; into the
   board in that of OpenCV's `GridBoard`, whose rows go down.
+- circles, acircles: the origin is the centre of a corner's circle, x follows the columns, y the
+  rows, and z points into the board. Columns of acircles are two rows apart, as in OpenCV.
 """
 
 from typing import Any, Self, get_args
@@ -24,8 +26,12 @@ _LEAST_COUNT = {
     "apriltag": 0,
     "aprilgrid": 1,
     "arucogrid": 1,
+    "circles": 3,
+    "acircles": 3,
 }
 """Minimum number of rows and of columns."""
+_PLAIN = ("chessboard", "circles", "acircles")
+"""Boards without markers."""
 _MOST_COUNT = 200
 """Maximum number of rows and of columns."""
 _LEAST_M = 0.0005
@@ -40,14 +46,15 @@ class Board:
 
     kind: BoardKind
     size_m: float
-    """Side of a square, or of the black square of a tag or of a marker of a grid, metres."""
+    """Side of a square, or of the black square of a tag or of a marker of a grid, metres. From
+    row to row of circles."""
     columns: int = 0
     """Number of inner corners of a chessboard along x, squares of a ChArUco board, markers of a
     grid."""
     rows: int = 0
     """Number along y."""
     marker_m: float = 0.0
-    """Side of a marker of a ChArUco board, metres."""
+    """Side of a marker of a ChArUco board, or diameter of a circle to print, metres."""
     dictionary: str = ""
     """Marker dictionary, OpenCV's name without DICT_: 4X4_50, APRILTAG_36h11."""
     tag: int | None = None
@@ -91,7 +98,7 @@ class Board:
                 f"markers of a ChArUco board are smaller than its squares, got"
                 f" {1000 * self.marker_m:g} mm in {1000 * self.size_m:g} mm; give `marker_mm`"
             )
-        if self.kind != "chessboard":
+        if self.kind not in _PLAIN:
             dictionary_of(self)
 
     @property
@@ -109,12 +116,17 @@ class Board:
     @property
     def half_turn(self) -> bool:
         """Whether the board looks the same after a rotation by 180 degrees."""
-        return self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0
+        odd = {
+            "chessboard": self.columns + self.rows,
+            "circles": 0,
+            "acircles": self.rows,
+        }
+        return odd.get(self.kind, 1) % 2 == 0
 
     @property
     def quarter_turn(self) -> bool:
         """Whether the corners look the same after a rotation by 90 degrees."""
-        return self.kind == "chessboard" and self.columns == self.rows
+        return self.kind in ("chessboard", "circles") and self.columns == self.rows
 
     def to_dict(self) -> JsonObject:
         """Return JSON values."""

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from evercal.calibration.boards.board import Board
+from evercal.calibration.boards.circles import find_circles
 from evercal.calibration.boards.corners import BoardView, Detection
 from evercal.calibration.boards.edges import sharpened
 from evercal.calibration.boards.marker_layout import Markers, OtherBoard
@@ -160,6 +161,8 @@ def _look(
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
     if board.kind == "chessboard":
         return _find_chessboard(grey, board)
+    if board.kind in ("circles", "acircles"):
+        return find_circles(grey, board)
     if board.kind == "charuco":
         return find_charuco(grey, board)
     return find_markers(grey, board)

@@ -53,7 +53,7 @@ def other_dictionary(images: Sequence[Image], board: Board) -> str:
 
     `images` are (H, W, 3).
     """
-    if board.kind == "chessboard":
+    if not board.dictionary:
         return ""
     hint = mirrored_hint(images, board)
     if hint:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evercal.calibration.boards.board import Board, dictionary_of
+from evercal.calibration.boards.circles import circle_points
 from evercal.errors import InputError, optional_module
 from evercal.typing import Array, Image, Pair
 
@@ -25,6 +26,8 @@ PAPERS_MM = {
 """Width and height of upright paper, smaller sheets first."""
 FILE_KINDS = (".pdf", ".png")
 """Endings of the files that `write_board` writes."""
+_CIRCLE = 0.6
+"""Diameter of a circle that is not stated, distances from row to row."""
 _MARGIN_MM = 8.0
 """White margin around the board and its footer."""
 _FOOTER_MM = 13.0
@@ -48,6 +51,15 @@ def board_image(board: Board, unit_px: int) -> Image:
         # The square between the first four inner corners is bright.
         bright = np.where((row + column) % 2 == 0, 255, 0).astype(np.uint8)
         return bright.repeat(unit_px, 0).repeat(unit_px, 1)
+    if board.kind in ("circles", "acircles"):
+        points = unit_px * (circle_points(board)[:, :2] / board.size_m + 1)
+        width, height = points.max(0) + unit_px
+        y, x = np.indices((round(height), round(width))) + 0.5
+        page = np.full(x.shape, 255, np.uint8)
+        radius = unit_px * (board.marker_m or _CIRCLE * board.size_m) / board.size_m / 2
+        for at_x, at_y in points:
+            page[np.hypot(x - at_x, y - at_y) < radius] = 0
+        return page
     if board.is_grid:
         raise InputError(
             f"an {board.kind} is not printed; take the print of Kalibr or OpenCV, or print"
@@ -142,7 +154,9 @@ def _draw_footer(
 def label(board: Board) -> str:
     """Return the line below a board: the options that detect it."""
     side = f"{1000 * board.size_m:g} mm"
-    if board.kind == "chessboard":
+    if board.kind in ("circles", "acircles"):
+        words = f"{board.kind}, {board.columns}x{board.rows}, {side} from row to row"
+    elif board.kind == "chessboard":
         words = (
             f"chessboard, {board.columns}x{board.rows} inner corners, squares of {side}"
         )

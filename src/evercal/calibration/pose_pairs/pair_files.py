@@ -82,6 +82,7 @@ class _Poses:
             quarter_turn=printed.quarter_turn,
             stated=self.board.camera_from == "file",
             size_m=printed.size_m,
+            board=printed,
             left_out=tuple(left_out),
         )
 

@@ -12,6 +12,8 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from evercal.calibration.boards.board import Board
+from evercal.calibration.boards.board_poses import board_poses
 from evercal.calibration.boards.corners import (
     BEND,
     Bend,
@@ -26,6 +28,7 @@ from evercal.calibration.boards.intrinsics import (
     lens_estimate,
 )
 from evercal.calibration.boards.row_shift import CornerNoise
+from evercal.calibration.boards.stated_lens import contradiction
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation
 from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, norms, pose_distance
@@ -208,6 +211,8 @@ class BoardCorners:
     """Whether the intrinsics are stated by the maker; else they come from these corners."""
     size_m: float | None = None
     """Stated side of a square, or of a tag, for messages."""
+    board: Board | None = None
+    """The printed board, if it is known."""
     left_out: Strings = ()
     """Images and pixels of corners that leave their neighbours."""
 
@@ -244,6 +249,15 @@ class BoardCorners:
             views=tuple(views),
             left_out=tuple(left_out),
         )
+
+    def contradiction(self) -> str:
+        """What the corners say against the stated intrinsics; empty if nothing."""
+        if not self.stated or not self.board:
+            return ""
+        views = {str(i): view for i, view in enumerate(self.views)}
+        poses = board_poses(self.board, self.camera, views)
+        found = contradiction(poses, views)
+        return found.words if found else ""
 
     @property
     def prior(self) -> LensPrior:

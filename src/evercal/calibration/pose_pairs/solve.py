@@ -113,7 +113,12 @@ def solve_pose_pairs(
     start, scale = quick_fit(pairs[rows], mount, scale_known)
     own_camera = corners is not None or not of_board
     in_order = pairs[np.sort(rows)]
-    require_agreement(in_order, mount, scale_known, start, own_camera)
+    try:
+        require_agreement(in_order, mount, scale_known, start, own_camera)
+    except InputError as error:
+        if corners and (cause := corners.contradiction()):
+            raise InputError(f"{cause}. With it, {error}") from None
+        raise
     lens = None
     if corners:
         refined = _by_corners(pairs, rows, mount, scale_known, corners)
