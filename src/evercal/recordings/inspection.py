@@ -117,11 +117,9 @@ def inspect_recording(recording: Recording) -> Inspection:
             )
     near = None
     if train and test:
-        same_m = SAME_M
+        same_m = SAME_M if recording.metric else SAME_M * largest
         if recording.metric:
             near = 100 * float(near_training(poses, test_poses).mean())
-        else:
-            same_m *= largest
         warnings += _copy_warnings(train, test, poses, test_poses, same_m)
     x, y, z = extent.tolist()
     return Inspection(
