@@ -55,7 +55,7 @@ FACES = ("__init__", "__main__")
 PRODUCT = ORDER[: ORDER.index("simulation")]
 MOST_LOCALIZING = 61
 """Modules of evercal that a program loads for localizing, at most."""
-MOST_LEARNING = 96
+MOST_LEARNING = 100
 """The same for learning."""
 
 

@@ -216,6 +216,11 @@ class PoseEquation:
             change=np.r_[np.zeros(12), at.extras - self.extras.mean],
         )
 
+    def viewing_rays(self, at: Unknowns) -> Array:
+        """(n, 3) from the camera to the board, in the fixed frame."""
+        camera = self.robot_translation + self.robot_rotation @ at.translations[0]
+        return at.translations[1] - camera
+
     def _shared(self, at: Unknowns) -> dict[str, SharedErrors]:
         """Residuals due to unit effects; a fixed camera sees the gripper move the other way."""
         lever = np.broadcast_to(at.translations[1], (len(self), 3))
@@ -249,9 +254,8 @@ class PoseEquation:
             "rotation about gripper": _rotated(board - gripper),
         }
         if "intrinsics" not in self.extras.groups:
-            ray = board - parent - self.robot_rotation @ at.translations[0]
             depth = np.zeros((n, 6, 1))
-            depth[:, :3, 0] = unit_vectors(ray, 1e-9)
+            depth[:, :3, 0] = unit_vectors(self.viewing_rays(at), 1e-9)
             directions["depth"] = depth
             directions["rotation about board"] = _rotated(np.zeros((n, 3)))
         return directions

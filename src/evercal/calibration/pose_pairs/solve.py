@@ -9,6 +9,7 @@ from evercal.calibration.boards.corners import board_pose
 from evercal.calibration.boards.intrinsics import moved_lens
 from evercal.calibration.boards.row_shift import CornerNoise
 from evercal.calibration.calibration import Calibration
+from evercal.calibration.pose_pairs.changed_focus import focus_warning
 from evercal.calibration.pose_pairs.checks import (
     SIZE_SIGMA,
     require_observable,
@@ -133,12 +134,16 @@ def solve_pose_pairs(
     # Errors that poses share look like a step, and a step like errors that poses share.
     if slip and slip.evidence < evidence:
         slip = None
+    focused = []
+    if of_board and not slip:
+        focused = focus_warning(equation, fit, rows, pairs.names)
     if not slip and evidence > WANTED:
         equation = sharing
         fit = robust_fit(equation, agreement(equation, fit.at))
     warnings: list[str] = []
     if scale_known:
         equation, fit, warnings = with_tested_size(equation, fit, corners, of_board)
+    warnings += focused
     if not slip:
         warnings += second_group(equation, fit, rows, pairs.names)
     else:
