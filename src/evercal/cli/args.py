@@ -189,6 +189,9 @@ class Reading(Named):
     """tf or joint states of a bag; required if there are several topics."""
     urdf: File = None
     """URDF of the robot, for recordings with joint angles."""
+    joint_map: File = None
+    """File that says which column each joint of the URDF is, its sense, zero, unit and coupling;
+    'evercal inspect' writes it."""
     pose_convention: Name = None
     """Format of the gripper poses, if the file's header does not state it; rad or deg for joint
     angles."""
@@ -202,15 +205,14 @@ class Reading(Named):
     """Use every N-th image."""
 
     def recording(
-        self, path: Path, name: str | None = None, whole_robot: bool = False
+        self, path: Path, name: str | None = None, **how: bool
     ) -> "Recording":
-        """Read the recording, with the values of all joints of a robot or of one arm."""
+        """Read the recording; `how` are further fields of `ReadOptions`."""
         from evercal.recordings import ReadOptions, load_recording
 
-        options: dict[str, Any] = vars(self).copy()
+        options: dict[str, Any] = {**vars(self), **how}
         format = options.pop("format")
-        given = ReadOptions(**options, whole_robot=whole_robot)
-        return load_recording(path, format, name, given)
+        return load_recording(path, format, name, ReadOptions(**options))
 
     def words(self) -> list[str]:
         """The options that were given, as words of a command."""

@@ -1,6 +1,8 @@
 """`evercal calibrate`."""
 
+import itertools
 import math
+import statistics
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import field, replace
 from pathlib import Path
@@ -16,9 +18,19 @@ from evercal.errors import InputError
 from evercal.progress import progress_bar
 
 if TYPE_CHECKING:
-    from evercal.calibration.calibration import Calibration, JointOffset, Rig
+    from evercal.calibration.calibration import (
+        Calibration,
+        ImageUse,
+        JointOffset,
+        Rig,
+    )
     from evercal.calibration.image_source import Images
     from evercal.localization.localizer import Localizer
+
+_GROUP = 3
+"""Number of rejected images that are one group, if they disagree alike."""
+_ALIKE = 0.2
+"""Largest difference of their distances, relative to the median."""
 
 
 @frozen
@@ -190,9 +202,26 @@ def calibration_lines(
     rejected = [image for image in images if not image.used]
     if images:
         yield f"  images       {len(images) - len(rejected)} of {len(images)} used"
-    for image in rejected:
-        yield f"    rejected   {image.name}: {image.reason}"
+    yield from _rejected_lines(rejected)
     yield f"  verdict      {calibration.verdict}"
+
+
+def _rejected_lines(rejected: "Sequence[ImageUse]") -> Iterator[str]:
+    """Images that disagree alike are one group."""
+    sizes = [image.residual_mm or 0.0 for image in rejected]
+    middle = statistics.median([size for size in sizes if size] or [0.0])
+    alike = [abs(size - middle) < _ALIKE * middle for size in sizes]
+    if sum(alike) < _GROUP:
+        alike = [False] * len(sizes)
+    group = list(itertools.compress(rejected, alike))
+    if group:
+        yield (
+            f"    rejected   {len(group)} images, {group[0].name} to {group[-1].name}: each"
+            f" disagrees with the others by about {middle:.1f} mm, as after one motion"
+        )
+    for image, known in zip(rejected, alike, strict=True):
+        if not known:
+            yield f"    rejected   {image.name}: {image.reason}"
 
 
 def held_out_lines(calibration: "Calibration") -> Iterator[str]:

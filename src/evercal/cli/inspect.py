@@ -1,7 +1,7 @@
 """`evercal inspect`."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, field
+from dataclasses import asdict, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +9,7 @@ from tyro.conf import Positional, arg
 
 from evercal.classes import frozen
 from evercal.cli import args
-from evercal.cli.console import numbers
+from evercal.cli.console import numbers, require_writable
 from evercal.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,14 +36,16 @@ class Inspect(args.Verb):
     """Gripper poses that the robot can reach; prints those whose images would help most."""
     count: args.Number = 5
     """Number of poses for --next."""
+    out: args.OutFile = Path("joint-map.json")
+    """Joint map to write, if the images show that joint values are to be read in another way."""
     gripper_from_camera: args.File = None
     """A rough gripper_from_camera for --coverage and --next: 4x4 matrix or calibration file.
     Without it, axes are those of the gripper."""
 
     def run(self) -> int:
-        from evercal.recordings.inspection import inspect_recording
+        from evercal.recordings.inspection import STILL, inspect_recording
 
-        recording = self.reading.recording(self.scene)
+        recording = self.reading.recording(self.scene, unchecked_joints=True)
         inspection = inspect_recording(recording)
         record = asdict(inspection)
         lines = list(_lines(inspection))
@@ -59,11 +61,49 @@ class Inspect(args.Verb):
         if self.coverage or self.next:
             self._advise(recording, record, lines)
         verb = ["learn", "MAP"]
-        if recording.arm and "evercal arm-in-view" in str(inspection.warnings):
+        still = bool(recording.arm) and STILL in str(inspection.warnings)
+        if still:
             verb = ["arm-in-view"]
-        then = [*verb, self.scene, *self.reading.words()]
+        reading = self._joints(recording, still, record, lines)
+        then = [*verb, self.scene, *reading.words()]
         self.answer(record, *lines, then=then)
         return 0
+
+    def _joints(
+        self,
+        recording: "Recording",
+        still: bool,
+        record: dict[str, object],
+        lines: list[str],
+    ) -> args.Reading:
+        """Compare joint values with the images, and write how to read them; how to read next."""
+        from evercal.calibration.from_map.joint_check import (
+            joint_sentence,
+            recorded_joints,
+        )
+        from evercal.robot.joint_test import OFFSET
+        from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND
+        from evercal.storage import write_json
+
+        verdict = recorded_joints(recording, EYE_TO_HAND if still else EYE_IN_HAND)
+        if not verdict or verdict.agrees:
+            return self.reading
+        if not verdict.readings and still:  # the images may show nothing but the arm
+            return self.reading
+        sentence = joint_sentence(verdict)
+        lines.append(f"warning: {sentence}")
+        found: dict[str, object] = {"sentence": sentence}
+        record["joints"] = found
+        arm = recording.arm
+        if not verdict.readings or not arm or not arm.read:
+            return self.reading
+        require_writable(self.out, "--out")
+        reading = verdict.readings[0].reading
+        joint_map = arm.read.after(reading[:, :OFFSET], reading[:, OFFSET])
+        write_json(self.out, joint_map.record(arm.rotates().tolist()))
+        found["joint_map"] = str(self.out)
+        lines.append(f"  joint map       {self.out} reads them so")
+        return replace(self.reading, joint_map=self.out)
 
     def _advise(
         self, recording: "Recording", record: dict[str, object], lines: list[str]

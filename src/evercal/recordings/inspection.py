@@ -20,6 +20,7 @@ from evercal.recordings.frame import (
 from evercal.recordings.images import file_of
 from evercal.recordings.pictures import look_at
 from evercal.recordings.poses.pose_evidence import rotation_warnings
+from evercal.recordings.stale_poses import stale_frames
 from evercal.typing import Strings, Triple
 
 SAME_M = 0.001
@@ -38,6 +39,8 @@ MOST_CAMERAS_LISTED = 4
 """Maximum number of intrinsics that are listed one by one; of more, each image size has a line."""
 
 
+STILL = "evercal arm-in-view"
+"""Words of a warning that the camera may stand still."""
 Owner = Literal["camera", "gripper", "none"]
 """Owner of the poses of a recording."""
 
@@ -112,9 +115,7 @@ def inspect_recording(recording: Recording) -> Inspection:
                 "all training frames look the same way; are the rotations missing?"
             )
         if shown.usable:
-            warnings += rotation_warnings(
-                train, poses, owner == "camera", recording.convention
-            )
+            warnings += _contradictions(recording, train, poses, owner)
     near = None
     if train and test:
         same_m = SAME_M if recording.metric else SAME_M * largest
@@ -136,6 +137,21 @@ def inspect_recording(recording: Recording) -> Inspection:
         warnings=tuple(warnings),
         **steps,
     )
+
+
+def _contradictions(
+    recording: Recording, train: Sequence[Frame], poses: SE3, owner: Owner
+) -> list[str]:
+    """Poses that the images contradict."""
+    stale = ""
+    if owner == "gripper":
+        stale = stale_frames(train)
+    if stale:
+        return [stale]
+    found = rotation_warnings(train, poses, owner == "camera", recording.convention)
+    if recording.arm:  # of joints, 'evercal inspect' says more
+        found = [warning for warning in found if STILL in warning]
+    return found
 
 
 def _require_image_sizes(frames: Sequence[Frame]) -> None:

@@ -48,7 +48,8 @@ FORMATS: dict[FormatName, RecordingFormat] = {
     "nerfstudio": RecordingFormat("nerfstudio", ("metres",)),
     "colmap": RecordingFormat("colmap", ("metres",)),
     "wrist": RecordingFormat(
-        "wrist", ("camera", "urdf", "whole_robot", "pose_convention", "poses")
+        "wrist",
+        ("camera", "urdf", "joint_map", "whole_robot", "pose_convention", "poses"),
     ),
     "lerobot": RecordingFormat(
         "lerobot",
@@ -57,6 +58,7 @@ FORMATS: dict[FormatName, RecordingFormat] = {
             "image_topic",
             "gripper_frame",
             "urdf",
+            "joint_map",
             "whole_robot",
             "pose_convention",
         ),
@@ -70,6 +72,7 @@ FORMATS: dict[FormatName, RecordingFormat] = {
             "base_frame",
             "gripper_frame",
             "urdf",
+            "joint_map",
             "whole_robot",
         ),
     ),
@@ -134,7 +137,7 @@ def load_recording(
     format = format_of(root, format)
     uses = FORMATS[format].uses
     for option in options.given():
-        if option not in ("every", "split", *FRAMES, *uses):
+        if option not in ("every", "split", "unchecked_joints", *FRAMES, *uses):
             users = [key for key, entry in FORMATS.items() if option in entry.uses]
             raise InputError(
                 f"`{option}`: not used by recordings of format {format}, only by"

@@ -46,12 +46,7 @@ def look_at(frames: Sequence[Frame]) -> Pictures:
         look = _look_of_blank(blank)
         words = f"{len(blank)} of {len(images)} images that were looked at are {look}"
         return Pictures((words,), 2 * len(blank) <= len(images))
-    tiny = [
-        cv2.resize(image, (40, 30), interpolation=cv2.INTER_AREA) for image in images
-    ]
-    steps = np.diff(np.array(tiny, float), axis=0)
-    change = np.abs(steps).mean((1, 2, 3))
-    if len(images) > 1 and np.median(change) < _SAME:
+    if len(images) > 1 and np.median(_changes(images)) < _SAME:
         return Pictures(
             ("all images are the same; is each pose that of its image?",), False
         )
@@ -60,6 +55,19 @@ def look_at(frames: Sequence[Frame]) -> Pictures:
             ("all images are blurred; check focus and exposure time",), usable=True
         )
     return Pictures((), usable=True)
+
+
+def changes(frames: Sequence[Frame]) -> Array:
+    """(n - 1,) mean change from image to image, grey values."""
+    return _changes([_small(frame.read_image()) for frame in frames])
+
+
+def _changes(images: Sequence[Image]) -> Array:
+    tiny = [
+        cv2.resize(image, (40, 30), interpolation=cv2.INTER_AREA) for image in images
+    ]
+    steps = np.diff(np.array(tiny, float), axis=0)
+    return np.abs(steps).mean((1, 2, 3))
 
 
 def _look_of_blank(images: Sequence[Image]) -> str:

@@ -28,6 +28,11 @@ class ReadOptions:
     """Name of the camera's optical frame. If omitted, that of the images of a bag."""
     urdf: Path | None = None
     """URDF of the robot, for joint angles. If omitted, the file beside them."""
+    joint_map: Path | None = None
+    """File that says which column each joint is, its sense, zero, unit and coupling, as 'evercal
+    inspect' writes it."""
+    unchecked_joints: bool = False
+    """Read joint values that are too large for radians, too, to find out what they are."""
     pose_convention: ConventionName | str | None = None
     """Convention of a pose file, see `read_robot_poses`; rad or deg for joint angles. If omitted,
     the file defines it."""

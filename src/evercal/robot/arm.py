@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from evercal.classes import frozen_arrays
 from evercal.geometry import SE3
+from evercal.robot.joint_map import JointMap
 from evercal.typing import Array, BoolArray, Pair, Strings
 
 
@@ -44,6 +45,8 @@ class Arm:
     assumed: tuple[Pair, ...] = ((0.0, 0.0),)
     """Heights of the stated base above its own, and lengths of a tool along the axis of its
     gripper, that may be meant by stated poses; metres."""
+    read: JointMap | None = None
+    """How its values were read, if they were recorded."""
 
     def rotates(self) -> BoolArray:
         """(k,) whether a value is an angle."""

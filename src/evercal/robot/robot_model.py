@@ -39,12 +39,15 @@ class RobotModel:
     """Links and joints of a URDF; its meshes are not read.
 
     `whole` is whether the values of all joints are read. The robot needs no gripper then: its pose
-    is that of its base.
+    is that of its base. `unchecked` values may be too large for radians.
     """
 
-    def __init__(self, path: PathLike, whole: bool = False) -> None:
+    def __init__(
+        self, path: PathLike, whole: bool = False, unchecked: bool = False
+    ) -> None:
         self.path = Path(path)
         self.whole = whole
+        self.unchecked = unchecked
         if not self.path.is_file():
             raise InputError(f"{path}: no such URDF file")
         if self.path.suffix == ".xacro":
@@ -110,7 +113,7 @@ class RobotModel:
         if missing:
             raise InputError(
                 f"{source}: no values for joint {', '.join(missing)}, which {gripper} depends on;"
-                f" given are {', '.join(names) or 'none'}"
+                f" given are {', '.join(names) or 'none'}; rename them, or give `joint_map`"
             )
         values = values[:, [names.index(name) for name in arm.joints]]
         notes = [
@@ -124,8 +127,12 @@ class RobotModel:
                 f"values of no joint that moves by itself: {', '.join(unused)}"
             )
         for name, column in zip(arm.joints, values.T, strict=True):
-            self._refuse_degrees(name, column, source)
-        for name, column in zip(arm.joints, values.T, strict=True):
+            problem = self._no_radians(name, column)
+            if problem and not self.unchecked:
+                raise InputError(f"{source}: {problem}")
+            if problem:
+                notes.append(problem)
+                break
             notes += self._beyond_limits(name, column)
         frames = FrameNames(base)
         if gripper != base:
@@ -260,15 +267,18 @@ class RobotModel:
             followers.append(name)
         return joint.name, factor, constant
 
-    def _refuse_degrees(self, name: str, column: Array, source: PathLike) -> None:
+    def _no_radians(self, name: str, column: Array) -> str:
+        """What to do about values that are too large; empty if they are not."""
         if self._joint_named[name].type != "revolute" or not column.size:
-            return
+            return ""
         largest = column[np.abs(column).argmax()]
-        if abs(largest) > _LARGEST_RAD:
-            raise InputError(
-                f"{source}: joint {name} is at {largest:.1f}, too far for radians; if these are"
-                f" degrees, write the column as {name}_deg or give `pose_convention` deg"
-            )
+        if abs(largest) <= _LARGEST_RAD:
+            return ""
+        return (
+            f"joint {name} is at {largest:.1f}, too far for radians; if these are degrees, write"
+            f" the column as {name}_deg or give `pose_convention` deg, else 'evercal inspect'"
+            " tries what they are and writes a file for `joint_map`"
+        )
 
     def _beyond_limits(self, name: str, column: Array) -> list[str]:
         """A sentence if values of a joint exceed its limits by 0.1, or two rotations."""

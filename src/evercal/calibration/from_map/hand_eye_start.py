@@ -20,6 +20,11 @@ from evercal.calibration.from_map.image_pairs import (
     ImagePair,
     image_pairs,
 )
+from evercal.calibration.from_map.joint_check import (
+    REPAIR,
+    joint_sentence,
+    joint_verdict,
+)
 from evercal.calibration.pose_pairs.checks import require_rotations
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
@@ -35,6 +40,7 @@ from evercal.recordings.frame import (
     stated_grippers,
 )
 from evercal.recordings.held_out import require_frames
+from evercal.recordings.stale_poses import stale_frames
 from evercal.robot.arm import Arm
 from evercal.robot.arm_offsets import ArmOffsets
 from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount
@@ -108,6 +114,8 @@ def gripper_frames(recording: Recording) -> tuple[Frame, ...]:
     """Training frames with a gripper pose; too few are refused."""
     frames = tuple(f for f in recording.train if f.base_from_gripper)
     require_frames(replace(recording, train=frames), MIN_GRIPPER_FRAMES)
+    if stale := stale_frames(frames):
+        raise InputError(f"{recording.name}: {stale}")
     return frames
 
 
@@ -133,6 +141,10 @@ def hand_eye_start(
         poses = poses[spread]
     pairs = image_pairs(frames, mount, encoder, on_progress, side)
     joints = arm and Joints(arm, np.array([frame.joints_rad for frame in frames]))
+    if joints:
+        verdict = joint_verdict(joints.arm, joints.values, pairs, mount)
+        if verdict and verdict.readings:
+            raise InputError(f"{joint_sentence(verdict)}; {REPAIR}")
     try:
         start = start_from_matches(poses, pairs, mount, joints)
     except InputError:
@@ -201,10 +213,18 @@ def start_from_matches(
     distance = epipolar.medians(best)
     agree = distance < largest
     if agree.sum() < max(LEAST_IMAGE_PAIRS, LEAST_SHARE * len(agree)):
+        causes = (
+            "the poses belong to these images, that they are poses of the gripper in the base"
+            " (not the inverse), and the order of their quaternions or angles"
+        )
+        if joints:
+            causes = (
+                "the joint values belong to these images and to this URDF; other senses, zeros,"
+                " units, orders and couplings of its joints were tried"
+            )
         raise InputError(
             f"the gripper's motion and the images agree in only {agree.sum()} of {len(agree)} pairs"
-            " of frames: check that the poses belong to these images, that they are poses of the"
-            " gripper in the base (not the inverse), and the order of their quaternions or angles"
+            f" of frames: check that {causes}"
         )
     if epipolar.share_in_front(best) < 0.5:
         raise InputError(

@@ -26,6 +26,7 @@ from evercal.geometry import (
     spread,
 )
 from evercal.recordings.poses.pairing import counted
+from evercal.recordings.stale_poses import stale_poses
 from evercal.storage.text_files import few
 from evercal.typing import Array, IntArray, JsonObject
 
@@ -43,6 +44,8 @@ _AT_REST_M = 1e-3
 """Distance from the first pose below which no pose moves."""
 _AT_REST_RAD = np.deg2rad(0.1)
 """Angle from the first pose below which no pose moves."""
+_STALE = 0.3
+"""Motion of the board in rows with stale robot poses, parts of that in all rows."""
 _NAMES = 5
 """Number of names of poses in a message."""
 _RECORD = "record 15 to 25 poses that differ by 20 to 60 deg about two axes and by 10 cm or more"
@@ -206,18 +209,30 @@ def _require_motion(pairs: PosePairs, scale_known: bool) -> None:
     if not scale_known:
         size = norms(pairs.camera_from_board.translation_m)
         unit = max(float(np.median(size)), 1e-12)
-    robot_still = _is_still(pairs.base_from_gripper, 1.0)
     camera_still = _is_still(pairs.camera_from_board, unit)
-    if robot_still and not camera_still:
-        raise InputError(
-            "the robot's pose is the same in every row while the board moves in the images; the"
-            " robot poses are stale: read them at the time of each image"
-        )
-    if camera_still and not robot_still:
+    robot = pairs.base_from_gripper
+    if camera_still and not _is_still(robot, 1.0):
         raise InputError(
             "the board's pose is the same in every image while the robot moved; the images or their"
             " poses are stale, or the mount is wrong"
         )
+    usual = _motion(pairs.camera_from_board)
+
+    def moved(rows: IntArray) -> bool:
+        # As much as in all images: noise moves a board less.
+        seen = _motion(pairs.camera_from_board[rows])
+        return not camera_still and bool((seen > _STALE * usual).all())
+
+    if stale := stale_poses(robot, pairs.names, moved):
+        raise InputError(
+            f"{stale} while the board moves in the images; the robot poses are stale: read them at"
+            " the time of each image"
+        )
+
+
+def _motion(poses: SE3) -> Array:
+    """(2,) median distance and angle from the first of (n,) poses to the others."""
+    return np.median(pose_distance(poses[0], poses[1:]), 1)
 
 
 def _is_still(poses: SE3, unit_m: float) -> bool:

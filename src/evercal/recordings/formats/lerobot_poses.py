@@ -13,7 +13,11 @@ from evercal.recordings.poses.conventions import (
     asking_for,
     pose_convention,
 )
-from evercal.recordings.poses.joint_tables import in_radians, poses_of_arm
+from evercal.recordings.poses.joint_tables import (
+    arm_poses,
+    joint_reading,
+    poses_of_arm,
+)
 from evercal.recordings.poses.pose_units import checked_poses
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
@@ -114,10 +118,9 @@ def _joint_poses(
     source = f"{root}: {STATE}"
     with named_errors(source, "names"):
         refuse_repeated(names, "rename the numbers")
-    model = RobotModel(options.urdf, options.whole_robot)
-    values = in_radians(model, names, values, [options.pose_convention] * len(names))
-    links = (options.base_frame, options.gripper_frame)
-    moved = model.poses(names, values, *links, source)
+    model = RobotModel(options.urdf, options.whole_robot, options.unchecked_joints)
+    read = joint_reading(model, names, source, options)
+    moved = arm_poses(model, read, values, source, options)
     return poses_of_arm(moved), moved.notes
 
 

@@ -190,9 +190,12 @@ def _rows(
     root: Path, file: Path, options: ReadOptions, convention: str | None
 ) -> tuple[RobotPoses, list[str]]:
     if file.name in _JOINTS:
-        model = RobotModel(options.urdf or urdf_beside(root), options.whole_robot)
-        links = options.base_frame, options.gripper_frame
-        return read_joint_poses(file, model, *links, options.pose_convention)
+        model = RobotModel(
+            options.urdf or urdf_beside(root),
+            options.whole_robot,
+            options.unchecked_joints,
+        )
+        return read_joint_poses(file, model, options)
     if file.name.startswith("metadata"):
         numbers = read_json(file, "Record3D file").get("poses") or []
         with named_errors(file, "poses"):

@@ -5,6 +5,7 @@ are radians, or degrees if a name ends in `_deg`, and metres for prismatic joint
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,9 @@ from evercal.errors import InputError
 from evercal.recordings.poses.pose_track import times_around
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.poses.row_files import LabelledRows, read_rows, row_labels
+from evercal.recordings.read_options import ReadOptions
+from evercal.robot.joint_map import JointMap
+from evercal.robot.joint_names import joints_by_column
 from evercal.robot.robot_model import ArmPoses, RobotModel
 from evercal.storage.text_files import (
     library_errors,
@@ -20,7 +24,7 @@ from evercal.storage.text_files import (
     read_json,
     refuse_repeated,
 )
-from evercal.typing import Array, BoolArray
+from evercal.typing import Array, BoolArray, PathLike
 
 _UNITS = ("deg", "rad", "m")
 """Endings of the names of columns."""
@@ -32,40 +36,68 @@ _JSON = (
 
 
 def read_joint_poses(
-    path: Path,
-    model: RobotModel,
-    base: str | None = None,
-    gripper: str | None = None,
-    unit: str | None = None,
+    path: Path, model: RobotModel, options: ReadOptions | None = None
 ) -> tuple[RobotPoses, list[str]]:
-    """Read joint angles and compute gripper poses, with notes.
-
-    `unit` is "rad" or "deg" of angles whose column states no unit; radians if omitted.
-    """
+    """Read joint angles and compute gripper poses, with notes."""
+    options = options or ReadOptions()
     rows = read_joints(path)
-    base, gripper = model.chosen_links(base, gripper)
-    names = []
-    units = []
-    for column in rows.columns:
+    read = joint_reading(model, rows.columns, path, options)
+    links = model.chosen_links(options.base_frame, options.gripper_frame)
+    if not model.read_arm(*links, read.joints, path).joints:
+        raise InputError(
+            f"{model.path}: no joint moves {links[1]} against {links[0]}; name other links"
+        )
+    moved = arm_poses(model, read, rows.values, path, options)
+    return poses_of_arm(moved, rows), moved.notes
+
+
+def joint_reading(
+    model: RobotModel, columns: Sequence[str], source: PathLike, options: ReadOptions
+) -> JointMap:
+    """Joints, and the columns that their values are made of."""
+    names: list[str] = []
+    units: list[str | None] = []
+    for column in columns:
         joint, _, ending = column.rpartition("_")
-        if (
-            model.has_joint(column)
-            or not model.has_joint(joint)
-            or ending not in _UNITS
-        ):
+        if model.has_joint(column) or not joint or ending not in _UNITS:
             joint = column
-            ending = unit
+            ending = options.pose_convention
         names.append(joint)
         units.append(ending)
-    if not model.read_arm(base, gripper, names, path).joints:
-        raise InputError(
-            f"{model.path}: no joint moves {gripper} against {base}; name other links"
-        )
-    with named_errors(path, "joint angles"):
-        refuse_repeated(filter(model.has_joint, names), "keep one column of each joint")
-    values = in_radians(model, names, rows.values, units)
-    moved = model.poses(names, values, base, gripper, path)
-    return poses_of_arm(moved, rows), moved.notes
+    links = model.chosen_links(options.base_frame, options.gripper_frame)
+    joints = model.arm(*links).joints
+    if model.whole:
+        joints = model.drivers()
+    found = joints_by_column(names, joints, not model.whole)
+    named = [found.get(name, name) for name in names]
+    with named_errors(str(source), "joint angles"):
+        refuse_repeated(filter(model.has_joint, named), "keep one column of each joint")
+    sizes = in_radians(model, named, np.ones((1, len(named))), units)[0]
+    read = JointMap.of_columns(named, columns, sizes)
+    if options.joint_map:
+        read = JointMap.read(options.joint_map).with_others(read, source)
+    return read
+
+
+def arm_poses(
+    model: RobotModel,
+    read: JointMap,
+    values: Array,
+    source: PathLike,
+    options: ReadOptions,
+) -> ArmPoses:
+    """Poses of an arm, from columns (n, m)."""
+    links = options.base_frame, options.gripper_frame
+    moved = model.poses(read.joints, read.values(values), *links, source)
+    own = read.of(moved.arm.joints)
+    renamed = []
+    for i, joint in enumerate(own.joints):
+        columns = [own.columns[j] for j in np.flatnonzero(own.matrix[i])]
+        if joint not in columns and f"{joint}_deg" not in columns:
+            renamed.append(f"{joint} from {' and '.join(columns)}")
+    if renamed:
+        moved.notes.append(f"values of joints by other names: {', '.join(renamed)}")
+    return moved._replace(arm=replace(moved.arm, read=own))
 
 
 def poses_of_arm(moved: ArmPoses, rows: LabelledRows | None = None) -> RobotPoses:

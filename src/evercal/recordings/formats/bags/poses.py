@@ -16,7 +16,12 @@ from evercal.recordings.formats.bags.tf_tree import (
     STATIC,
     TfTree,
 )
-from evercal.recordings.poses.joint_tables import interpolate, poses_of_arm
+from evercal.recordings.poses.joint_tables import (
+    arm_poses,
+    interpolate,
+    joint_reading,
+    poses_of_arm,
+)
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.frame_names import FrameNames
@@ -45,7 +50,7 @@ def poses_at_images(
     zero = int(stamps_ns[0])
     stamps = (stamps_ns - zero).astype(float) * 1e-9
     if options.urdf:
-        model = RobotModel(options.urdf, options.whole_robot)
+        model = RobotModel(options.urdf, options.whole_robot, options.unchecked_joints)
         return _from_joints(bag, stamps, zero, model, options)
     tree, times = _tf(bag, zero, options.pose_topic)
     base = tree.frame(options.base_frame, BASES, "base_frame")
@@ -110,9 +115,12 @@ def _from_joints(
     values = np.zeros((len(stamps), len(tracks)))
     valid = np.ones(len(stamps), bool)
     times = np.empty(0)
-    needed = model.read_arm(base, gripper, [*tracks], bag.path).joints
+    read = joint_reading(model, [*tracks], bag.path, options)
+    joints = model.read_arm(base, gripper, read.joints, bag.path).joints
+    known = read.of([joint for joint in joints if joint in read.joints])
+    used = np.any(known.matrix, axis=0, keepdims=True)[0]
     for column, (name, track) in enumerate(tracks.items()):
-        if name not in needed:
+        if not used[column]:
             continue
         topic = next(iter(track))
         if options.pose_topic in track:
@@ -125,7 +133,7 @@ def _from_joints(
         times, positions = np.array(track[topic]).T
         values[:, column], is_valid = interpolate(times, positions, stamps)
         valid &= is_valid
-    moved = model.poses([*tracks], values, base, gripper, bag.path)
+    moved = arm_poses(model, read, values, bag.path, options)
     if not valid.any():
         _refuse_times(bag, stamps, times, "the joint states")
     return ImagePoses(poses_of_arm(moved), valid, "gripper", moved.notes)
