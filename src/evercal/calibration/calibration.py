@@ -306,6 +306,8 @@ class RigPair(NamedTuple):
     first: str
     second: str
     first_from_second: UncertainPose
+    moments: int | None = None
+    """Number of moments that both saw, where they were solved together."""
 
     def to_dict(self) -> JsonObject:
         """Return JSON values."""
@@ -317,12 +319,13 @@ class RigPair(NamedTuple):
             "quaternion_wxyz": pose.rotation_wxyz.tolist(),
             "matrix": pose.matrix().tolist(),
             "covariance": self.first_from_second.covariance.tolist(),
+            "moments": self.moments,
         }
 
 
 @frozen_arrays
 class Rig:
-    """Cameras that stand still in one base frame."""
+    """Cameras that stand still in one base frame, or in that of the first one."""
 
     cameras: Mapping[str, Calibration]
     relative: tuple[RigPair, ...]

@@ -8,16 +8,26 @@ from evercal.calibration.calibration import Calibration, read_calibration
 from evercal.errors import InputError
 from evercal.storage.provenance import Made
 from evercal.storage.stages import is_store
+from evercal.storage.text_files import read_json
 from evercal.typing import JsonObject, PathLike
 
 
 def calibration_at(path: PathLike) -> Calibration:
-    """Read a calibration from its file, a map (`MAP`) or one of its scenes (`MAP:SCENE`)."""
+    """Read a calibration from its file, a map (`MAP`), or one of its scenes (`MAP:SCENE`).
+
+    A camera of a rig is `RIG.json:CAMERA`.
+    """
     root, _, scene = os.fspath(path).rpartition(":")
     if is_store(Path(path)):
         return learned_calibration(Path(path))
     if root and is_store(Path(root)):
         return learned_calibration(Path(root), scene)
+    if root and Path(root).is_file():
+        cameras = read_json(Path(root), "file of several cameras").get("cameras", {})
+        if scene not in cameras:
+            known = ", ".join(cameras) or "no cameras"
+            raise InputError(f"{root}: has {known}, and not {scene!r}")
+        return Calibration.from_dict(cameras[scene])
     return read_calibration(path)
 
 

@@ -136,7 +136,7 @@ class Calibrate(args.Verb):
         record = rig.to_dict()
         for name, calibration in rig.cameras.items():
             record["cameras"][name] |= at_record(calibration, point)
-        self.answer(record, *_rig_lines(rig, point))
+        self.answer(record, *rig_lines(rig, point))
         return 0
 
 
@@ -272,15 +272,16 @@ def joint_lines(joints: Sequence["JointOffset"], file: object) -> Iterator[str]:
             yield f"joint {joint.name}: not determined; {joint.open}"
 
 
-def _rig_lines(rig: "Rig", point: args.Point | None) -> Iterator[str]:
+def rig_lines(rig: "Rig", point: args.Point | None = None) -> Iterator[str]:
+    """Several cameras in lines."""
     for name, calibration in rig.cameras.items():
         first, *others = calibration_lines(calibration, point)
         yield f"{name}: {first}"
         yield from others
-    for first, second, pose in rig.relative:
+    for first, second, pose, moments in rig.relative:
         position = numbers(1000 * pose.pose.translation_m, "+.2f")
         spread = motion(pose.sigma_mm, pose.sigma_deg, " and ")
-        yield (
-            f"{first}_from_{second}: {position} mm, standard deviation at most {spread}"
-            " (independent errors assumed)"
-        )
+        how = "standard deviation at most {} (independent errors assumed)"
+        if moments is not None:
+            how = f"standard deviation {{}}, {moments} moments in common"
+        yield f"{first}_from_{second}: {position} mm, {how.format(spread)}"

@@ -273,7 +273,7 @@ def fit_picks(
         )
     in_map = np.stack([point for point, _ in triangulated.values()])
     in_base = np.stack([point for _, point in triangulated.values()])
-    start = _umeyama(in_map, in_base, scale_known)
+    start = umeyama(in_map, in_base, scale_known)
     centre = in_base.mean(0)
     before = start.base_from_map.rotation
     shift = start.base_from_map.translation_m - centre
@@ -337,15 +337,21 @@ def _triangulated(images: Sequence[Picks]) -> dict[str, ArrayPair]:
     return points
 
 
-def _umeyama(source: Array, target: Array, scale_known: bool) -> Similarity:
-    a = source - source.mean(0)
-    b = target - target.mean(0)
-    spread = np.linalg.svd(b, compute_uv=False)
+def require_spread(points: Array) -> None:
+    """Refuse points (n, 3) on one line."""
+    spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
     if spread[1] < 0.02 * spread[0]:
         raise InputError(
-            "the touched points lie on one line, so the map could turn about it; touch a point"
-            " beside the line too"
+            "the touched points lie on one line, so what they hold could turn about it; touch a"
+            " point beside the line too"
         )
+
+
+def umeyama(source: Array, target: Array, scale_known: bool) -> Similarity:
+    """The similarity that moves points (n, 3) to others (n, 3), by least squares."""
+    a = source - source.mean(0)
+    b = target - target.mean(0)
+    require_spread(b)
     rotation = Rotation.align_vectors(b, a)[0]
     scale = 1.0
     if not scale_known:

@@ -47,7 +47,7 @@ class PairFiles:
 
 
 @frozen_arrays
-class _Poses:
+class PoseRows:
     """The n poses of a table, or of a file of `evercal detect`."""
 
     names: Strings | None
@@ -61,9 +61,11 @@ class _Poses:
     board: BoardPoses | None = None
 
     def row_names(self) -> Strings:
+        """Names of images, or numbers of rows."""
         return self.names or tuple(f"row {i + 1}" for i in range(len(self.poses)))
 
     def corners_of(self, rows: IntArray) -> BoardCorners | None:
+        """Corners of the images of rows, from a file of `evercal detect`."""
         if not self.board:
             return None
         views = []
@@ -129,6 +131,14 @@ def read_pairs(files: PairFiles) -> tuple[PosePairs, BoardCorners | None]:
     return pairs, camera.corners_of(images)
 
 
+def read_camera_poses(
+    path: Path, convention: str | None = None, inverted: bool = False
+) -> PoseRows:
+    """Read camera_from_board of every row, or its inverse."""
+    invert: Inverted | None = "camera" if inverted else None
+    return _read(PairFiles(path, path, None, convention, invert), "camera")
+
+
 def read_streams(files: PairFiles) -> tuple[PoseTrack, CameraTrack]:
     """Read robot and camera poses with times of separate clocks, or raise InputError."""
     robot = _read(files, "robot")
@@ -146,8 +156,8 @@ def read_streams(files: PairFiles) -> tuple[PoseTrack, CameraTrack]:
 
 
 def _streams(
-    robot: _Poses,
-    camera: _Poses,
+    robot: PoseRows,
+    camera: PoseRows,
 ) -> tuple[PoseTrack, CameraTrack]:
     assert robot.stamps_s is not None
     assert camera.stamps_s is not None
@@ -165,7 +175,7 @@ def _streams(
 def _read(
     files: PairFiles,
     role: Literal["robot", "camera"],
-) -> _Poses:
+) -> PoseRows:
     """Read the poses of one file; messages name its role and its own option."""
     path = files.robot
     convention = files.robot_convention
@@ -203,7 +213,7 @@ def _read(
             used,
             camera_from=role == "camera",
         )
-    return _Poses(
+    return PoseRows(
         table.names,
         stamps,
         poses,
@@ -212,7 +222,7 @@ def _read(
     )
 
 
-def _read_board_file(path: Path, inverted: bool) -> _Poses:
+def _read_board_file(path: Path, inverted: bool) -> PoseRows:
     board = read_board_poses(path)
     if not board.images:
         raise InputError(f"{path}: holds no images; repeat evercal detect")
@@ -225,7 +235,7 @@ def _read_board_file(path: Path, inverted: bool) -> _Poses:
     if inverted:
         poses = poses.inverse()
     board = replace(board, images=tuple(images))
-    return _Poses(
+    return PoseRows(
         names,
         times_in_names(names),
         poses,

@@ -96,7 +96,7 @@ def touched_data(
     if not camera:
         raise InputError("the calibration has no intrinsics, so points have no pixels")
     points = touches.positions(touches.base_from_gripper, np.zeros(3))
-    _require_usable(picks, points, camera)
+    require_usable(picks, points, camera)
     measured = np.stack([[*pick.pixel, pick.depth_m] for pick in picks])
     known = np.isfinite(measured)
     own = np.full(measured.shape, pick_px)
@@ -143,9 +143,10 @@ def touched_data(
     )
 
 
-def _require_usable(
+def require_usable(
     picks: Sequence[PickedPoint], points: Mapping[str, Array], camera: Camera
 ) -> None:
+    """Refuse picks of points that were not touched, or outside of the image."""
     for image, point, (x, y), _ in picks:
         if point not in points:
             raise InputError(

@@ -363,10 +363,11 @@ def without_ending(name: str) -> str:
 
 def same_numbers(first: Sequence[str], second: Sequence[str]) -> bool:
     """Whether names of two kinds end in the same numbers, as pose_1 and image-001.png."""
-    numbers = [*map(_last_number, first)]
-    return None not in numbers and numbers == [*map(_last_number, second)]
+    numbers = [*map(last_number, first)]
+    return None not in numbers and numbers == [*map(last_number, second)]
 
 
-def _last_number(name: str) -> int | None:
+def last_number(name: str) -> int | None:
+    """The last number in the name of an image."""
     match = re.search(r"(\d+)\D*$", without_ending(name))
     return match and int(match[1])

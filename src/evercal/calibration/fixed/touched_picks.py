@@ -1,0 +1,115 @@
+"""A fixed camera by touched points and their pixels: a pose from points, without a map."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from evercal.calibration.boards.corners import BoardView, board_pose
+from evercal.calibration.calibration import Calibration
+from evercal.calibration.fixed.corner_fit import corner_fit
+from evercal.calibration.fixed.sightings import Sightings
+from evercal.calibration.fixed.solved import image_uses, judged, solve_still
+from evercal.calibration.from_map.align import require_spread
+from evercal.calibration.picked_points import PickedPoint
+from evercal.calibration.pose_pairs.pairs import BoardCorners
+from evercal.calibration.unseen.touched import require_usable
+from evercal.errors import InputError
+from evercal.geometry import SE3, Camera, UncertainPose, norms
+from evercal.recordings.poses.pairing import counted
+from evercal.typing import Array, BoolArray
+
+_LEAST = 4
+"""Least number of points."""
+_JUDGES = 5
+"""Least number of points that tell that another one is wrong."""
+_MOST_OUT = 1 / 3
+"""Largest share of points that are left out."""
+_SIGMAS = 4.0
+"""Residual of a wrong point, standard deviations, beside `_LENS_SHARE` of the image's width."""
+_LENS_SHARE = 0.005
+_CONTRADICT = (
+    "the picks contradict the points, by {:.0f} px at {}: is each name given to the point that was"
+    " picked, are pixels u right and v down, are the points x, y, z of the base (no axis mirrored),"
+    " and is `camera` of these images?"
+)
+
+
+def solve_picks(
+    points: Mapping[str, Array],
+    picks: Sequence[PickedPoint],
+    camera: Camera,
+    touch_m: float,
+    pick_px: float,
+) -> Calibration:
+    """Calibrate a fixed camera by four or more touched points that were picked in its images.
+
+    Args:
+        points: (3,) by name, base frame, metres.
+        picks: Their pixels; those of all images count as one image.
+        camera: Stated intrinsics.
+        touch_m: Standard deviation per axis of a touched point.
+        pick_px: That of a pick.
+    """
+    require_usable(picks, points, camera)
+    names = {pick.point for pick in picks}
+    if len(names) < _LEAST:
+        raise InputError(
+            f"{counted(len(names), 'point')} picked; give {_LEAST} or more, better 8, not all on"
+            " one line"
+        )
+    require_spread(np.stack([points[name] for name in names]))
+    places = np.stack([points[pick.point] for pick in picks])
+    view = BoardView(places, np.stack([pick.pixel for pick in picks]))
+    labels = [f"{pick.point} in {pick.image}" for pick in picks]
+    try:
+        start = board_pose(view, camera).camera_from_board
+        distance = norms(start.apply(places)).mean()
+        usual_px = float(np.hypot(pick_px, camera.fx * touch_m / distance))
+        limit = _SIGMAS * usual_px + _LENS_SHARE * camera.width
+        used = _agreeing(view, labels, camera, limit)
+    except ValueError:
+        raise InputError(_CONTRADICT.format(np.inf, "all of them")) from None
+    corners = BoardCorners(camera, (view[used],), stated=True)
+    start = board_pose(view[used], camera).camera_from_board
+    fit = corner_fit(corners, SE3.stack([start]), usual_px)
+    fit.require_one_pose()
+    seen = Sightings(
+        "camera", ("picks",), ("",), fit.poses, fit.covariance, fit.slopes, fit, 0.0
+    )
+    # Of the touches a part is the tool's, which all share.
+    base = UncertainPose(SE3.identity(), np.diag(np.repeat([touch_m**2, 1e-8], 3)))
+    calibration = solve_still([seen], base)["camera"]
+    miss = norms(view.pixels - fit.lens.camera.project(fit.poses[0].apply(places)))
+    misses = 1000 * miss * distance / camera.fx
+    checks = replace(
+        calibration.checks,
+        residual_mm=float(np.sqrt((misses[used] ** 2).mean())),
+        target_m=float(distance),
+    )
+    images = image_uses(labels, used, misses)
+    return judged(replace(calibration, images=images, checks=checks))
+
+
+def _agreeing(
+    view: BoardView, labels: Sequence[str], camera: Camera, limit_px: float
+) -> BoolArray:
+    """(k,) picks that agree with each other; those that do not are left out one by one."""
+    used = np.ones(len(labels), bool)
+    while True:
+        pose = board_pose(view[used], camera)
+        worst = norms(pose.residual_px).max()
+        if worst < limit_px:
+            return used
+        rows = np.flatnonzero(used)
+        out = len(labels) - len(rows)
+        if len(rows) <= _JUDGES or out + 1 > _MOST_OUT * len(labels):
+            break
+        costs = []
+        for row in rows:
+            used[row] = False
+            costs.append(board_pose(view[used], camera).squared_px)
+            used[row] = True
+        used[rows[np.argmin(costs)]] = False
+    most = np.flatnonzero(used)[norms(pose.residual_px).argmax()]
+    raise InputError(_CONTRADICT.format(worst, labels[most]))

@@ -1,0 +1,239 @@
+"""Fixed cameras by a board at a known place, and beside each other by a moving board."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evercal.calibration.boards.board import Board
+from evercal.calibration.boards.board_poses import board_poses
+from evercal.calibration.boards.corners import BoardView
+from evercal.calibration.evidence import plus
+from evercal.calibration.fixed.sightings import read_sightings
+from evercal.calibration.fixed.solved import solve_place, solve_rig
+from evercal.calibration.transform_file import read_place
+from evercal.errors import InputError
+from evercal.geometry import SE3, Camera, UncertainPose
+from evercal.typing import Array
+
+CAMERA = Camera(640, 480, 620, 621, 322.3, 238.1, (0.02, 0.0, 0.0, 0.0, 0.0))
+TRUE = Camera(640, 480, 621.5, 622, 323.5, 237, (0.015, 0.0, 0.0, 0.0, 0.0))
+PLACE = SE3.exp([0.5, 0.1, 0.02, 3.0, 0.2, 0.4])
+SIGMA = np.diag(np.repeat(np.square([1e-3, np.deg2rad(0.2)]), 3))
+TAG = 0.05 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+GRID = np.array([[0.025 * i, 0.025 * j, 0] for j in range(6) for i in range(9)])
+
+
+def board_file(
+    path: Path, corners: Array, boards: Sequence[SE3], noise: float, columns: int = 9
+) -> Path:
+    """What `detect` writes of images of a board, with the stated intrinsics."""
+    kind = {"kind": "apriltag", "dictionary": "APRILTAG_36h11"}
+    if len(corners) > 4:
+        kind = {"kind": "chessboard", "columns": columns, "rows": 6}
+    rng = np.random.default_rng(len(boards))
+    views = {}
+    for i, pose in enumerate(boards):
+        pixels = TRUE.project(pose.apply(corners))
+        pixels = pixels + rng.normal(0, noise, pixels.shape)
+        views[f"{i:02d}.png"] = BoardView(corners, pixels)
+    board = Board.from_dict({"size_m": 0.025, **kind})
+    board_poses(board, CAMERA, views).write(path)
+    return path
+
+
+def seen_at(seed: int, tilt: float = 0.5, metres: float = 0.7) -> SE3:
+    rng = np.random.default_rng(seed)
+    turn = rng.uniform(0, 2 * np.pi)
+    tilted = SE3.exp([0, 0, 0, tilt * np.cos(turn), tilt * np.sin(turn), 0])
+    rolled = SE3.exp([0, 0, 0, 0, 0, rng.uniform(0, 6)])
+    return SE3.from_translation([0.05, -0.03, metres]) @ tilted @ rolled
+
+
+@pytest.mark.parametrize(
+    ("corners", "images"),
+    [(TAG, 1), (TAG, 4), (GRID, 1), (GRID - GRID.mean(0), 3)],
+)
+def test_a_board_at_a_known_place_calibrates_with_an_honest_sigma(
+    tmp_path: Path, corners: Array, images: int
+) -> None:
+    inside = 0
+    for seed in range(5):
+        error = np.random.default_rng(seed).normal(size=6) * np.sqrt(np.diag(SIGMA))
+        camera_from_board = seen_at(seed)
+        file = board_file(
+            tmp_path / "left.json", corners, [camera_from_board] * images, 0.15
+        )
+        place = UncertainPose(PLACE, SIGMA)
+        found = solve_place(read_sightings([file]), place)["left"]
+        truth = plus(PLACE, error) @ camera_from_board.inverse()
+        inside += found.uncertain_pose.squared_mahalanobis(truth) < 12.6
+        assert found.sigma_mm < 30
+        assert "turned by 90 or 180 deg" in (found.checks.left_open or ())[0]
+    assert inside >= 5
+
+
+def test_the_accuracy_of_the_place_is_in_the_sigma(tmp_path: Path) -> None:
+    file = board_file(tmp_path / "left.json", GRID, [seen_at(1)], 0.1)
+    sigmas = []
+    for accuracy in ("0.1,0.01", "20,0.01"):
+        place = UncertainPose(*read_place("0.5,0.1,0.02,1,0,0,0", accuracy))
+        sigmas.append(solve_place(read_sightings([file]), place)["left"].sigma_mm)
+    assert sigmas[1] ** 2 - sigmas[0] ** 2 == pytest.approx(400, rel=0.5)
+
+
+@pytest.mark.parametrize(
+    ("corners", "poses", "columns", "message"),
+    [
+        (0.15 * TAG, [seen_at(1)], 9, "fit two poses"),
+        (0.3 * TAG, [seen_at(2, 0.3, 1.5)], 9, "fit two poses"),
+        (GRID, [seen_at(1)], 8, "looks the same after a turn"),
+        (GRID, [seen_at(1)], 6, "looks the same after a turn"),
+        (GRID, [seen_at(1), seen_at(2), seen_at(3)], 9, "did cameras stand still"),
+    ],
+)
+def test_boards_that_leave_the_camera_open_are_refused(
+    tmp_path: Path, corners: Array, poses: list[SE3], columns: int, message: str
+) -> None:
+    file = board_file(tmp_path / "left.json", corners, poses, 0.3, columns)
+    with pytest.raises(InputError, match=message):
+        solve_place(read_sightings([file]), UncertainPose(PLACE, SIGMA))
+
+
+@pytest.mark.parametrize(
+    ("text", "accuracy", "message"),
+    [
+        ("0.5,0.1,0.02,1,1,0,0", "1,0.2", "unit quaternion"),
+        ("500,100,20,1,0,0,0", "1,0.2", "give metres"),
+        ("0.5,a,0.02,1,0,0,0", "1,0.2", "unit quaternion"),
+        ("0.5,0.1,0.02,1,0,0,0", "1", "millimetres and degrees"),
+        ("0.5,0.1,0.02,1,0,0,0", "-1,0.2", "above 0"),
+        ("0.5,0.1,0.02", "1,0.2", "no such file|does not exist|missing"),
+    ],
+)
+def test_places_that_are_none_are_refused(
+    text: str, accuracy: str, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        read_place(text, accuracy)
+
+
+CAMERAS = {
+    "left": SE3.identity(),
+    "right": SE3.exp([0.3, 0.01, 0.05, 0.05, -0.3, 0.02]),
+    "front": SE3.exp([-0.35, 0.02, 0.08, -0.1, 0.4, 0.1]),
+}
+
+
+def tables(
+    folder: Path, rows: dict[str, range], names: str = "{:03d}.png"
+) -> list[Path]:
+    """Tables of the poses of a moving board before each camera, 0.5 mm and 0.2 deg off."""
+    files = []
+    for number, (name, images) in enumerate(rows.items()):
+        rng = np.random.default_rng(number)
+        lines = ["image,x,y,z,qw,qx,qy,qz"]
+        for i in images:
+            g = np.random.default_rng(100 + i)
+            board = SE3.from_translation([*g.uniform(-0.1, 0.1, 2), 1.0])
+            board = board @ SE3.exp([0, 0, 0, *g.normal(0, 0.4, 3)])
+            pose = plus(
+                CAMERAS[name].inverse() @ board,
+                rng.normal(size=6) * np.repeat([5e-4, 3e-3], 3),
+            )
+            values = [*pose.translation_m, *pose.rotation_wxyz]
+            lines.append(f"{names.format(i)}," + ",".join(f"{v:.8f}" for v in values))
+        if not names:
+            lines = [line.split(",", 1)[1] for line in lines]
+        files.append(folder / f"{name}.csv")
+        files[-1].write_text("\n".join(lines) + "\n")
+    return files
+
+
+@pytest.mark.parametrize("names", ["{:03d}.png", "", "cam/{:03d}.jpg"])
+def test_cameras_are_calibrated_beside_each_other(tmp_path: Path, names: str) -> None:
+    rows = {"left": range(12), "right": range(12), "front": range(12)}
+    if names:
+        rows = {"left": range(10), "right": range(5, 15), "front": range(8, 15)}
+    rig = solve_rig(read_sightings(tables(tmp_path, rows, names)))
+    assert [pair.second for pair in rig.relative] == ["right", "front"]
+    for pair in rig.relative:
+        truth = CAMERAS[pair.second]
+        assert pair.first_from_second.squared_mahalanobis(truth) < 16.8
+        assert pair.first_from_second.sigma_mm < 5
+    assert rig.cameras["right"].parent_frame == "left"
+    assert rig.relative[0].moments == (5 if names else 12)
+
+
+def test_a_chain_of_cameras_needs_no_common_view_of_all(tmp_path: Path) -> None:
+    rows = {"left": range(8), "right": range(4, 14), "front": range(8, 14)}
+    rig = solve_rig(read_sightings(tables(tmp_path, rows)))
+    assert rig.relative[1].moments == 0
+    pose = rig.relative[1].first_from_second
+    assert pose.squared_mahalanobis(CAMERAS["front"]) < 16.8
+
+
+@pytest.mark.parametrize("outlier", [3, 6])
+def test_a_wrong_moment_is_named(tmp_path: Path, outlier: int) -> None:
+    files = tables(tmp_path, {"left": range(12), "right": range(12)})
+    lines = files[1].read_text().splitlines()
+    lines[outlier + 1] = lines[outlier + 1].split(",")[0] + ",0.1,0,0.8,1,0,0,0"
+    files[1].write_text("\n".join(lines))
+    rig = solve_rig(read_sightings(files))
+    rejected = [use.name for use in rig.cameras["right"].images if not use.used]
+    assert rejected == [f"{outlier:03d}.png"]
+    pose = rig.relative[0].first_from_second
+    assert pose.squared_mahalanobis(CAMERAS["right"]) < 16.8
+
+
+def test_cameras_in_parts_are_named(tmp_path: Path) -> None:
+    rows = {"left": range(8), "right": range(4, 12), "front": range(20, 26)}
+    files = tables(tmp_path, rows)
+    message = r"2 parts.*left \+ right \(8 images.*front \(6 images, first 020"
+    with pytest.raises(InputError, match=message):
+        solve_rig(read_sightings(files))
+    with pytest.raises(InputError, match="one camera alone"):
+        solve_rig(read_sightings(files[:1]))
+    with pytest.raises(InputError, match="name one camera twice"):
+        read_sightings([files[0], files[0]])
+
+
+def inverse(lines: list[list[str]]) -> None:
+    for row in lines:
+        pose = SE3([*map(float, row[4:])], [*map(float, row[1:4])]).inverse()
+        row[1:] = [*map(str, [*pose.translation_m, *pose.rotation_wxyz])]
+
+
+def reversed_rows(lines: list[list[str]]) -> None:
+    poses = [row[1:] for row in lines][::-1]
+    for row, pose in zip(lines, poses, strict=True):
+        row[1:] = pose
+
+
+def larger(lines: list[list[str]]) -> None:
+    for row in lines:
+        row[1:4] = [str(1.5 * float(value)) for value in row[1:4]]
+
+
+@pytest.mark.parametrize(
+    ("wreck", "message"),
+    [
+        (inverse, "`invert` camera"),
+        (reversed_rows, "one name"),
+        (larger, "1.5 times as large as in left"),
+    ],
+)
+def test_cameras_that_contradict_each_other_are_refused(
+    tmp_path: Path, wreck: object, message: str
+) -> None:
+    files = tables(tmp_path, {"left": range(12), "right": range(12)})
+    head, *rest = files[1].read_text().splitlines()
+    lines = [line.split(",") for line in rest]
+    assert callable(wreck)
+    wreck(lines)
+    files[1].write_text("\n".join([head, *map(",".join, lines)]))
+    with pytest.raises(InputError, match=message):
+        solve_rig(read_sightings(files))
