@@ -46,7 +46,9 @@ class PickedPoint(NamedTuple):
     """Measured depth."""
 
 
-def read_points(path: Path) -> dict[str, Array]:
+def read_points(
+    path: Path,
+) -> dict[str, Array]:
     """Touched points (3,) by name: lines of name, x, y, z in metres, base frame."""
     rows = _rows(path, 1, POINTS)
     with named_errors(path, "table of points"):
@@ -55,7 +57,9 @@ def read_points(path: Path) -> dict[str, Array]:
     return {name: point for (name,), point in rows}
 
 
-def read_positions(path: Path) -> tuple[Names, Array] | None:
+def read_positions(
+    path: Path,
+) -> tuple[Names, Array] | None:
     """Names, if any, and positions (n, 3) of a table without rotations; None for other files.
 
     Columns x, y and z, with a unit or in metres; or three numbers in a row, after a name.
@@ -85,7 +89,10 @@ def read_positions(path: Path) -> tuple[Names, Array] | None:
     return names, _in_metres(path, points)
 
 
-def _in_metres(path: Path, points: Array) -> Array:
+def _in_metres(
+    path: Path,
+    points: Array,
+) -> Array:
     """Points that are not in millimetres."""
     if not np.abs(points).max() < _MOST_M:
         raise InputError(
@@ -95,7 +102,10 @@ def _in_metres(path: Path, points: Array) -> Array:
     return points
 
 
-def paired_positions(first: Path, second: Path) -> tuple[Strings, Array, Array]:
+def paired_positions(
+    first: Path,
+    second: Path,
+) -> tuple[Strings, Array, Array]:
     """Names and positions (n, 3) of two tables, by names that both have, else in order."""
     names = []
     values = []
@@ -126,7 +136,9 @@ def paired_positions(first: Path, second: Path) -> tuple[Strings, Array, Array]:
     return names[0] or names[1] or rows, values[0], values[1]
 
 
-def read_picks(path: Path) -> list[PickedPoint]:
+def read_picks(
+    path: Path,
+) -> list[PickedPoint]:
     """Points in images: lines of image, name, u, v in pixels."""
     rows = _rows(path, 2, PICKS)
     with named_errors(path, "table of points"):
@@ -135,7 +147,11 @@ def read_picks(path: Path) -> list[PickedPoint]:
     return [PickedPoint(image, name, pixel) for (image, name), pixel in rows]
 
 
-def write_picks(path: Path, rows: object, images: Collection[str]) -> int:
+def write_picks(
+    path: Path,
+    rows: object,
+    images: Collection[str],
+) -> int:
     """Write rows of image, name, u, v that a page has sent, and return their number.
 
     Raises:
@@ -156,7 +172,11 @@ def write_picks(path: Path, rows: object, images: Collection[str]) -> int:
     return len(rows)
 
 
-def _rows(path: Path, names: int, columns: str) -> list[tuple[list[str], Array]]:
+def _rows(
+    path: Path,
+    names: int,
+    columns: str,
+) -> list[tuple[list[str], Array]]:
     """Words and numbers of every line of a table of these columns; a header line is skipped."""
     lines = read_text(path, "table of points").splitlines()
     with named_errors(path, "table of points"):

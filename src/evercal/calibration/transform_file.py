@@ -14,7 +14,9 @@ _MOST_M = 50.0
 """Distance of a place from the base above which the unit is wrong."""
 
 
-def read_transform(path: PathLike) -> SE3:
+def read_transform(
+    path: PathLike,
+) -> SE3:
     """Read a rigid transform from a calibration file or from a 4x4 matrix as text."""
     text = read_text(Path(path), "file")
     if text.lstrip().startswith("{"):
@@ -31,7 +33,10 @@ def read_transform(path: PathLike) -> SE3:
         ) from None
 
 
-def read_place(text: str, accuracy: str) -> tuple[SE3, Array]:
+def read_place(
+    text: str,
+    accuracy: str,
+) -> tuple[SE3, Array]:
     """A pose as seven numbers or in a file, and its covariance (6, 6) from `mm,deg` per axis."""
     try:
         sigma = np.array([*map(float, accuracy.split(","))]) * [1e-3, np.pi / 180]

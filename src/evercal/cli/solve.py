@@ -138,7 +138,7 @@ class Solve(args.Verb):
             )
         from evercal.calibration.picked_points import read_positions
 
-        tables = (self.robot_poses, self.camera_poses[0])
+        tables = (self.robot_poses, *self.camera_poses)
         plain = [f for f in tables if read_positions(f) is not None]
         if not plain:
             return {}
@@ -148,7 +148,7 @@ class Solve(args.Verb):
                 " that a fixed camera sees at the robot's own point go without: positions of both"
                 " and --mount eye_to_hand"
             )
-        return {"": self._paired(*tables)}
+        return {"": self._paired(*plain)}
 
     def _by_points(self, file: Path) -> "Calibration":
         known = self.known

@@ -54,7 +54,10 @@ class _Rows(NamedTuple):
     """(n, 6, q) by shared errors of one standard deviation."""
 
     @classmethod
-    def of(cls, seen: Sequence[Sightings]) -> "_Rows":
+    def of(
+        cls,
+        seen: Sequence[Sightings],
+    ) -> "_Rows":
         names = np.concatenate([own.moments for own in seen])
         poses = SE3.stack([pose for own in seen for pose in own.poses])
         shared = block_diag(*[np.concatenate(own.shared) for own in seen])
@@ -94,7 +97,11 @@ class _Rows(NamedTuple):
             middles.append(average_poses(seen) if len(seen) > 2 else seen[0])
         return cameras, SE3.stack(middles)
 
-    def slopes(self, cameras: SE3, predicted: SE3) -> Array:
+    def slopes(
+        self,
+        cameras: SE3,
+        predicted: SE3,
+    ) -> Array:
         """(n, 6, p) of the predictions by cameras but the first, boards and shared errors."""
         across = cameras[self.camera].rotation_matrix().transpose(0, 2, 1)
         by_camera = np.zeros((len(across), 6, 6))
@@ -109,13 +116,18 @@ class _Rows(NamedTuple):
         return np.concatenate([cameras_of, boards_of, self.shared], 2)
 
 
-def _spread(blocks: Array, number: IntArray) -> Array:
+def _spread(
+    blocks: Array,
+    number: IntArray,
+) -> Array:
     """Blocks (n, 6, 6) in the columns (n, 6, 6 k) of their numbers."""
     chosen = np.eye(int(number.max()) + 1)[number]
     return np.einsum("nab,nk->nakb", blocks, chosen).reshape(len(blocks), 6, -1)
 
 
-def adjust(seen: Sequence[Sightings]) -> Adjustment:
+def adjust(
+    seen: Sequence[Sightings],
+) -> Adjustment:
     """Estimate all cameras robustly."""
     require_connected(seen)
     rows = _Rows.of(seen)
@@ -125,7 +137,8 @@ def adjust(seen: Sequence[Sightings]) -> Adjustment:
     freedom = max((rows.poses.translation_m.size - unknown / 2), _FREEDOM)
     least = float(any(own.fit for own in seen))
     noise = np.ones(2)
-    for _ in range(_ROUNDS):
+    rounds = 0
+    while True:
         predicted = cameras[rows.camera].inverse() @ boards[rows.moment]
         residual = deviations(rows.poses, predicted) - rows.shared @ effects
         scale = np.repeat(noise, 3)
@@ -144,6 +157,9 @@ def adjust(seen: Sequence[Sightings]) -> Adjustment:
         boards = plus(boards, moved[len(cameras) :])
         effects = effects + step[unknown:]
         noise *= _larger(white, freedom, noise, least)
+        rounds += 1
+        if rounds == _ROUNDS:
+            break
     # By so much an ellipsoid is larger whose noise was estimated.
     told = [own.fit.freedom for own in seen if own.fit]
     few = 6 * f.isf(0.05, 6, min(told, default=max(freedom / 2, _FREEDOM)))
@@ -155,7 +171,12 @@ def adjust(seen: Sequence[Sightings]) -> Adjustment:
     return Adjustment(cameras, np.stack(blocks), rows.camera, weights > _USED, residual)
 
 
-def _larger(white: Array, freedom: float, noise: Array, least: float) -> Array:
+def _larger(
+    white: Array,
+    freedom: float,
+    noise: Array,
+    least: float,
+) -> Array:
     """Factors (2,) of the noise of positions and rotations, by residuals in units of it."""
     squares = (white.reshape(-1, 2, 3) ** 2).sum(2)
     most = _MOST * np.median(squares, 0)

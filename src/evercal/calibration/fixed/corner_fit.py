@@ -75,7 +75,9 @@ class CornerFit(NamedTuple):
 
 
 def corner_fit(
-    corners: BoardCorners, starts: SE3, touched_px: float = 0.0
+    corners: BoardCorners,
+    starts: SE3,
+    touched_px: float = 0.0,
 ) -> CornerFit:
     """Estimate poses and intrinsics.
 

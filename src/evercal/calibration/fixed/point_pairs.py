@@ -29,6 +29,7 @@ _LEAST_USED = 0.6
 """Share of points that agree."""
 _MOST_APART = 0.05
 """Largest standard deviation, parts of the extent of the points."""
+_ROUNDS = 5
 _FREEDOM = 2.0
 """Weight of the usual noise of depths, degrees of freedom."""
 _SCALE_SIGMAS = 4.0
@@ -45,24 +46,17 @@ _UNMATCHED = (
 )
 
 
-def solve_points(names: Strings, robot: Array, seen: Array) -> Calibration:
+def solve_points(
+    names: Strings,
+    robot: Array,
+    seen: Array,
+) -> Calibration:
     """Calibrate a fixed camera by points (n, 3) in the base and in the camera frame, metres."""
-    if len(names) < _LEAST:
-        raise InputError(
-            f"{counted(len(names), 'point')} by robot and camera; give {_LEAST} or more, better 20,"
-            " not all on one line"
-        )
-    umeyama(seen, robot, True)  # refuses points on one line
-    extent = float(np.median(pdist(seen)))
-    ratio = float(np.median(pdist(robot))) / extent
-    if abs(np.log(ratio)) > _OTHER_UNIT:
-        raise InputError(
-            f"the robot's points lie {ratio:.4g} times as far apart as the camera's: give both in"
-            " metres, and each point in the same row of both"
-        )
+    extent = _extent(seen, robot)
     misses = _least_median(seen, robot)
     sigma = float(np.median(misses)) / chi2.median(3) ** 0.5
-    for _ in range(5):
+    rounds = 0
+    while True:
         used = misses < _SIGMAS * max(sigma, TOUCH_M)
         if used.mean() < _LEAST_USED or sigma > _MOST_APART * extent:
             mirrored = _least_median(seen * [1, 1, -1], robot)
@@ -82,6 +76,9 @@ def solve_points(names: Strings, robot: Array, seen: Array) -> Calibration:
         squared = float((misses[used] ** 2).sum())
         usual = _FREEDOM * np.square([TOUCH_M, DEPTH_M]).sum()
         sigma = float(np.sqrt((usual + squared) / freedom))
+        rounds += 1
+        if rounds == _ROUNDS:
+            break
     covariance = _covariance(pose, scale * seen[used], robot[used], sigma)
     covariance *= 6 * f.isf(0.05, 6, freedom) / chi2.isf(0.05, 6)
     warnings = []
@@ -91,26 +88,50 @@ def solve_points(names: Strings, robot: Array, seen: Array) -> Calibration:
             f"the camera's lengths are {100 / scale - 100:+.1f} % longer than the robot's: check"
             " its depth scale; the calibration allows for it"
         )
+    checks = Checks(
+        residual_mm=1000 * float(np.sqrt(squared / used.sum())),
+        residual_deg=0.0,
+        target_m=float(np.median(norms(seen))),
+        scale=scale,
+        scale_sigma=spread,
+        left_open=(_SAME_POINT,),
+        warnings=warnings,
+    )
+    images = image_uses(names, used, 1000 * misses)
     return judged(
         Calibration(
-            mount="eye_to_hand",
-            parent_from_child=pose,
-            covariance=covariance[:6, :6],
-            images=image_uses(names, used, 1000 * misses),
-            checks=Checks(
-                residual_mm=1000 * float(np.sqrt(squared / used.sum())),
-                residual_deg=0.0,
-                target_m=float(np.median(norms(seen))),
-                scale=scale,
-                scale_sigma=spread,
-                left_open=(_SAME_POINT,),
-                warnings=warnings,
-            ),
+            "eye_to_hand", pose, covariance[:6, :6], images=images, checks=checks
         )
     )
 
 
-def _covariance(pose: SE3, seen: Array, robot: Array, sigma: float) -> Array:
+def _extent(
+    seen: Array,
+    robot: Array,
+) -> float:
+    """Usual distance of two points; refuses few, on one line, or of two units."""
+    if len(seen) < _LEAST:
+        raise InputError(
+            f"{counted(len(seen), 'point')} by robot and camera; give {_LEAST} or more, better 20,"
+            " not all on one line"
+        )
+    umeyama(seen, robot, True)  # refuses points on one line
+    extent = float(np.median(pdist(seen)))
+    ratio = float(np.median(pdist(robot))) / extent
+    if abs(np.log(ratio)) > _OTHER_UNIT:
+        raise InputError(
+            f"the robot's points lie {ratio:.4g} times as far apart as the camera's: give both in"
+            " metres, and each point in the same row of both"
+        )
+    return extent
+
+
+def _covariance(
+    pose: SE3,
+    seen: Array,
+    robot: Array,
+    sigma: float,
+) -> Array:
     """(7, 7) of the pose and of the logarithm of the scale; the noise along the ray is its own."""
     rotation = pose.rotation_matrix()
     slope = np.zeros((len(seen), 3, 7))
@@ -131,7 +152,10 @@ def _covariance(pose: SE3, seen: Array, robot: Array, sigma: float) -> Array:
     return (covariance + covariance.T) / 2
 
 
-def _least_median(seen: Array, robot: Array) -> Array:
+def _least_median(
+    seen: Array,
+    robot: Array,
+) -> Array:
     """(n,) misses of the sample of three points that has the least median of them."""
     rng = np.random.default_rng(0)
     best = np.full(len(seen), np.inf)

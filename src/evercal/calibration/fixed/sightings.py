@@ -48,7 +48,12 @@ class Sightings:
     """Relative error of the board's size."""
 
     @classmethod
-    def of(cls, name: str, table: PoseRows, moments: Sequence[str]) -> "Sightings":
+    def of(
+        cls,
+        name: str,
+        table: PoseRows,
+        moments: Sequence[str],
+    ) -> "Sightings":
         """The images of a table that show the board."""
         rows = np.flatnonzero(table.measured)
         if not len(rows):
@@ -65,7 +70,7 @@ class Sightings:
             shared = SIZE_SIGMA * poses.translation_m * [0, 0, 1]
             shared = np.pad(shared, ((0, 0), (0, 3)))[..., None]
         names = table.row_names()
-        images = tuple(names[row] for row in rows)
+        images = tuple(names[row] for row in rows.tolist())
         return cls(
             name,
             images,
@@ -78,7 +83,9 @@ class Sightings:
 
 
 def read_sightings(
-    files: Sequence[Path], convention: str | None = None, inverted: bool = False
+    files: Sequence[Path],
+    convention: str | None = None,
+    inverted: bool = False,
 ) -> list[Sightings]:
     """Read camera_from_board of every camera and pair their images.
 
@@ -97,7 +104,9 @@ def read_sightings(
     return [Sightings.of(*row) for row in rows]
 
 
-def _usual(poses: SE3) -> Array:
+def _usual(
+    poses: SE3,
+) -> Array:
     """(n, 6, 6) usual covariance of poses, whose size is estimated later."""
     place = poses.translation_m
     ray = unit_vectors(place)[:, :, None]
@@ -110,7 +119,8 @@ def _usual(poses: SE3) -> Array:
 
 
 def _moments(
-    tables: Sequence[PoseRows], cameras: Strings | list[str]
+    tables: Sequence[PoseRows],
+    cameras: Strings | list[str],
 ) -> list[list[str]]:
     """Names of the moments of all rows."""
     if all(table.names for table in tables):
@@ -133,7 +143,9 @@ def _moments(
     return [[*map(str, range(count))] for count in counts]
 
 
-def require_connected(cameras: Sequence[Sightings]) -> None:
+def require_connected(
+    cameras: Sequence[Sightings],
+) -> None:
     """Refuse cameras that share no moment with the others, by name."""
     parts: list[list[Sightings]] = []
     for camera in cameras:

@@ -31,7 +31,8 @@ _UNSEEN_TURN = (
 
 
 def solve_place(
-    cameras: Sequence[Sightings], base_from_board: UncertainPose
+    cameras: Sequence[Sightings],
+    base_from_board: UncertainPose,
 ) -> dict[str, Calibration]:
     """Calibrate fixed cameras by a board that stands still at a known place in the base."""
     for camera in cameras:
@@ -59,7 +60,9 @@ def solve_still(
     return _solved([place, *still], FrameNames(), left_open)
 
 
-def solve_rig(cameras: Sequence[Sightings]) -> Rig:
+def solve_rig(
+    cameras: Sequence[Sightings],
+) -> Rig:
     """Estimate fixed cameras beside the first one by a board that moves before them."""
     if len(cameras) < 2:
         raise InputError(
@@ -78,7 +81,10 @@ def solve_rig(cameras: Sequence[Sightings]) -> Rig:
     return Rig(solved, tuple(pairs))
 
 
-def _require_one_size(first: Sightings, second: Sightings) -> None:
+def _require_one_size(
+    first: Sightings,
+    second: Sightings,
+) -> None:
     """Refuse cameras that state another size of the board, or another unit."""
     rows = {moment: i for i, moment in enumerate(first.moments)}
     pairs = [(rows[m], i) for i, m in enumerate(second.moments) if m in rows]
@@ -102,7 +108,9 @@ def _require_one_size(first: Sightings, second: Sightings) -> None:
 
 
 def _solved(
-    cameras: Sequence[Sightings], frames: FrameNames, left_open: Strings = ()
+    cameras: Sequence[Sightings],
+    frames: FrameNames,
+    left_open: Strings = (),
 ) -> dict[str, Calibration]:
     """All cameras but the first, by name."""
     adjusted = adjust(cameras)
@@ -146,7 +154,9 @@ def _solved(
 
 
 def image_uses(
-    names: Sequence[str], used: BoolArray, mm: Array
+    names: Sequence[str],
+    used: BoolArray,
+    mm: Array,
 ) -> tuple[ImageUse, ...]:
     """The use of images or points, by whether they agree and how far they are off."""
     uses = []
@@ -156,7 +166,9 @@ def image_uses(
     return tuple(uses)
 
 
-def judged(calibration: Calibration) -> Calibration:
+def judged(
+    calibration: Calibration,
+) -> Calibration:
     """The calibration with its verdict and the number of its images or points."""
     checks = replace(
         calibration.checks,

@@ -92,7 +92,10 @@ def solve_picks(
 
 
 def _agreeing(
-    view: BoardView, labels: Sequence[str], camera: Camera, limit_px: float
+    view: BoardView,
+    labels: Sequence[str],
+    camera: Camera,
+    limit_px: float,
 ) -> BoolArray:
     """(k,) picks that agree with each other; those that do not are left out one by one."""
     used = np.ones(len(labels), bool)
