@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from evercal.calibration.boards.layout_files import layout_readings, read_tags
 from evercal.calibration.picked_points import read_picks, read_points
 from evercal.calibration.transform_file import read_transform
 from evercal.geometry import SE3, Camera, pose_distance
@@ -50,7 +51,7 @@ RECORDINGS = {
 }
 SINGLE_FILES = {
     "joints.csv", "joints.json", "camera.txt", "touched.csv", "picks.csv", "base_from_camera.txt",
-    "pusht/meta/info.json",
+    "pusht/meta/info.json", "layout.csv",
 }  # fmt: skip
 CAMERAS = {
     "camera.json", "camera_info.yaml", "camera_opencv.yaml", "camera_opencv.json",
@@ -173,6 +174,14 @@ def test_touched_points(page: Path) -> None:
     first = read_picks(page / "picks.csv")[0]
     assert first[:2] == ("images/a.jpg", "corner")
     np.testing.assert_allclose(first.pixel, [311.5, 204.0])
+
+
+def test_layout_of_tags(page: Path) -> None:
+    tags = read_tags(page / "layout.csv")
+    assert [tag["size"] for tag in tags.values()] == [[0.04], [0.04]]
+    layout = next(layout_readings(tags, 1.0))
+    np.testing.assert_allclose(layout[3].mean(0), 0, atol=1e-12)
+    np.testing.assert_allclose(layout[7] - layout[3], [[0.12, 0.01, 0]] * 4, atol=1e-12)
 
 
 def test_matrix(page: Path) -> None:

@@ -25,7 +25,7 @@ from evercal.geometry import SE3, Camera
 from evercal.recordings.cameras.camera_file import centred_camera, read_camera_of_size
 from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import first_size
-from evercal.recordings.poses.row_files import is_number
+from evercal.recordings.poses.row_files import numbers_by_image
 from evercal.recordings.read_options import ReadOptions
 from evercal.storage.text_files import named_errors, path_inside, read_text
 
@@ -66,25 +66,13 @@ def load(root: Path, options: ReadOptions) -> Recording:
     return Recording(root.resolve().name, train, test, lost)
 
 
-def numbers_by_image(file: Path, text: str, layout: str) -> dict[str, list[float]]:
-    """Numbers of lines that begin with the name of an image, by that name."""
-    rows = {}
-    for number, line in enumerate(filter(str.strip, text.splitlines()), start=1):
-        name, *words = line.split()
-        numbers = list(map(float, filter(is_number, words)))
-        if len(numbers) != len(layout.split()) - 1 or not np.isfinite(numbers).all():
-            raise InputError(f"{file}: line {number} is not {layout!r}: {line[:60]!r}")
-        rows[name] = numbers
-    return rows
-
-
 def _poses(file: Path) -> dict[str, SE3]:
     """base_from_camera of each image of a list."""
     text = read_text(file, "list of images")
     rows = text.splitlines()[_HEADER:]
     poses = {}
     with named_errors(file, "list of images"):
-        for name, numbers in numbers_by_image(file, "\n".join(rows), _LAYOUT).items():
+        for name, numbers in numbers_by_image("\n".join(rows), _LAYOUT).items():
             inverse = np.array(numbers[3:]) * _CONJUGATE
             pose = SE3(inverse, np.array(numbers[:3]))
             poses[path_inside(name, "the name of an image")] = pose

@@ -24,9 +24,8 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera
 from evercal.recordings.cameras.camera_file import centred_camera
-from evercal.recordings.formats.cambridge import numbers_by_image
 from evercal.recordings.frame import Frame, Recording
-from evercal.recordings.poses.row_files import is_number
+from evercal.recordings.poses.row_files import is_number, numbers_by_image
 from evercal.storage.text_files import named_errors, read_text
 from evercal.typing import Array, Size
 
@@ -101,7 +100,7 @@ def _by_structure_from_motion(file: Path, size: Size) -> dict[str, tuple[Camera,
     text = read_text(file, "pose file", f"get the folder pgt/sfm of {_SOURCE}")
     poses = {}
     with named_errors(file, "pose file"):
-        for name, (*pose, focal) in numbers_by_image(file, text, _LAYOUT).items():
+        for name, (*pose, focal) in numbers_by_image(text, _LAYOUT).items():
             camera_from_base = SE3(np.array(pose[:4]), np.array(pose[4:]))
             own = centred_camera(focal, size)
             poses[frame_key(name)] = (own, camera_from_base.inverse())

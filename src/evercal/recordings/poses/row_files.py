@@ -93,6 +93,18 @@ def read_rows(path: Path, contents: str) -> LabelledRows:
         return LabelledRows(names, stamps, columns, values)
 
 
+def numbers_by_image(text: str, layout: str) -> dict[str, list[float]]:
+    """Numbers of lines that begin with the name of an image, by that name."""
+    rows = {}
+    for number, line in enumerate(filter(str.strip, text.splitlines()), start=1):
+        name, *words = line.split()
+        numbers = list(map(float, filter(is_number, words)))
+        if len(numbers) != len(layout.split()) - 1 or not np.isfinite(numbers).all():
+            raise ValueError(f"line {number} is not {layout!r}: {line[:60]!r}")
+        rows[name] = numbers
+    return rows
+
+
 def table_cells(lines: Sequence[str]) -> Cells:
     """(n, k) cells of lines of text; missing cells at the end of a line are empty.
 
