@@ -8,33 +8,25 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.corners import (
-    BoardPose,
     BoardView,
     board_pose,
     board_pose_candidates,
-    lens_vector,
 )
 from evercal.calibration.boards.intrinsics import (
-    LensPrior,
-    lens_estimate,
-    moved_camera,
     rough_camera,
 )
 from evercal.calibration.boards.layout_files import layout_readings, read_tags
 from evercal.calibration.boards.marker_layout import Markers
-from evercal.calibration.boards.row_shift import CornerNoise
+from evercal.calibration.boards.tag_bundle import Bundle, adjusted
 from evercal.calibration.boards.tags import Corners, square, view_of, with_corners
 from evercal.classes import frozen
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, cross_matrix, norms
+from evercal.geometry import Camera, norms
 from evercal.storage.text_files import named_errors
 from evercal.typing import Array, ArrayPair, Size, Strings
 
@@ -50,55 +42,10 @@ _UNITS = (1.0, 0.01, 0.001)
 """Metres of a unit of files."""
 _WORSE = 1.5
 """Factor by which a layout that images contradict enlarges the residuals."""
-_MAX_STEP = 0.2
-"""Maximum relative change of focal lengths and sides in a round."""
-_STRAY = 5.0
-"""Residual of a tag in an image, usual ones, above which it is left out."""
-_CONVERGED = 1e-3
-"""Squared Mahalanobis length of a change that ends bundle adjustment, a term."""
-_FIXED = 1e-9
-"""Standard deviation of what bundle adjustment keeps."""
-_MAX_ROUNDS = 60
-"""Maximum number of rounds of bundle adjustment."""
-_TERMS = 7
-"""Unknowns of a tag: position, rotation, relative size."""
 _SCALES = np.geomspace(0.2, 5, 41)
 """Sides of a tag that are tried first, sides of the kept one."""
 _MOST_IMAGES = 60
 """Number of images that place a tag."""
-
-
-class LooseTags(NamedTuple):
-    """Tags that move by themselves, as a departure of a board from its drawing."""
-
-    corners: Array
-    """(t, 4, 3) metres."""
-
-    @property
-    def terms(self) -> Array:
-        """(7 t,) zeros: shifts, rotations about the middle, relative sizes."""
-        return np.zeros(_TERMS * len(self.corners))
-
-    def slopes(self, points: Array) -> Array:
-        """Return the (k, 3, 7 t) derivative of corners (k, 3) by the terms."""
-        tag = KDTree(self.corners.reshape(-1, 3)).query(points)[1] // 4
-        arms = points - self.corners.mean(1)[tag]
-        slopes = np.zeros((len(points), 3, len(self.corners), _TERMS))
-        row = np.arange(len(points))
-        slopes[row, :, tag, :3] = np.eye(3)
-        slopes[row, :, tag, 3:6] = -cross_matrix(arms)
-        slopes[row, :, tag, 6] = arms
-        return slopes.reshape(len(points), 3, -1)
-
-    def moved(self, change: Array) -> "LooseTags":
-        """The tags after a (7 t,) change."""
-        corners = []
-        for own, terms in zip(self.corners, change.reshape(-1, _TERMS), strict=True):
-            middle = own.mean(0)
-            turn = Rotation.from_rotvec(terms[3:6])
-            arms = turn.apply(own - middle) * np.exp(terms[6])
-            corners.append(middle + terms[:3] + arms)
-        return LooseTags(np.array(corners))
 
 
 @frozen
@@ -180,30 +127,38 @@ class Arrangement:
                 f"warning: {path.name} was scaled by {scale:.5g}, so that tag {first} measures"
                 f" {1000 * self.board.size_m:g} mm",
             )
+        return corners, (
+            *notes,
+            *self._contradictions(path.name, corners, shown, camera),
+        )
+
+    def _contradictions(
+        self, name: str, corners: Corners, shown: Sequence[Markers], camera: Camera
+    ) -> Strings:
+        """What images say against a layout."""
         start = Bundle(
             corners,
             camera,
             0.0,
         )
-        rigid = _adjusted(
+        rigid = adjusted(
             shown,
             start,
             {*corners},
             bool(self.camera),
         )
-        loose = _adjusted(
+        loose = adjusted(
             shown,
             rigid,
             {min(corners)},
             bool(self.camera),
         )
         if rigid.sigma_px < _WORSE * loose.sigma_px:
-            return corners, notes
+            return ()
         pairs = [(own, loose.corners[number]) for number, own in corners.items()]
         moved_mm = 1000 * max(norms(other - own).max() for own, other in pairs)
-        return corners, (
-            *notes,
-            f"warning: the images contradict {path.name}: corners fit to {rigid.sigma_px:.2f} px"
+        return (
+            f"warning: the images contradict {name}: corners fit to {rigid.sigma_px:.2f} px"
             f" with it and to {loose.sigma_px:.2f} px with tags moved by up to {moved_mm:.1f} mm;"
             " measure again, or give `layout` estimate",
         )
@@ -231,7 +186,7 @@ class Arrangement:
             camera,
             0.0,
         )
-        corners = _adjusted(
+        corners = adjusted(
             found,
             start,
             {kept},
@@ -306,94 +261,3 @@ def _recurring(
     costs = [norms(candidates[:, None] - own).mean(-1).min(1) for own in corners]
     cost = np.median(costs, 0)
     return float(cost.min()), candidates[cost.argmin()]
-
-
-class Bundle(NamedTuple):
-    """Tags and intrinsics after bundle adjustment."""
-
-    corners: Corners
-    camera: Camera
-    sigma_px: float
-    """Standard deviation of a corner coordinate."""
-
-
-def _adjusted(
-    found: Sequence[Markers], start: Bundle, kept: set[int], stated: bool
-) -> Bundle:
-    """Adjust camera poses, tags that are not `kept`, and intrinsics that are not stated."""
-    numbers = sorted(start.corners)
-    loose = LooseTags(np.array([start.corners[number] for number in numbers]))
-    camera = start.camera
-    prior = _prior(
-        camera,
-        stated,
-        [number in kept for number in numbers],
-    )
-    lens = len(lens_vector(camera))
-    shown = [own.without({*own.ids.tolist()} - {*numbers}) for own in found]
-    starts: dict[int, SE3] = {}
-    corners = start.corners
-    sigma_px = np.inf
-    for _ in range(_MAX_ROUNDS):
-        poses: dict[int, BoardPose] = {}
-        for k, own in enumerate(shown):
-            view = view_of(own, corners)
-            if view:
-                poses[k] = board_pose(
-                    view,
-                    camera,
-                    starts.get(k),
-                    loose,
-                )
-        starts = {k: pose.camera_from_board for k, pose in poses.items()}
-        fits = list(poses.values())
-        sigma_px = CornerNoise.plain(fits).sigma_px
-        change, known = lens_estimate(
-            fits,
-            sigma_px,
-            camera,
-            loose,
-            prior,
-        )
-        steps = np.r_[change[:2] / camera.fx, change[lens:].reshape(-1, _TERMS)[:, 6]]
-        change = change / max(1.0, np.abs(steps).max() / _MAX_STEP)
-        loose = loose.moved(change[lens:])
-        camera = moved_camera(camera, change[:lens])
-        corners = dict(
-            zip(
-                numbers,
-                loose.corners,
-                strict=True,
-            )
-        )
-        if change @ known @ change < _CONVERGED * len(change):
-            rms = {k: norms(fit.residual_px.reshape(-1, 8)) for k, fit in poses.items()}
-            most = _STRAY * float(np.median(np.concatenate([*rms.values()])))
-            strays = {k: shown[k].ids[own > most].tolist() for k, own in rms.items()}
-            if not any(strays.values()):
-                break
-            shown = [own.without(strays.get(k, ())) for k, own in enumerate(shown)]
-    return Bundle(
-        corners,
-        camera,
-        sigma_px,
-    )
-
-
-def _prior(
-    camera: Camera,
-    stated: bool,
-    kept: Sequence[bool],
-) -> LensPrior:
-    """What is known of intrinsics and tags before."""
-    usual = LensPrior.usual(camera)
-    vector = lens_vector(camera)
-    lens = len(vector)
-    mean = np.r_[usual.mean[:lens], np.zeros(_TERMS * len(kept))]
-    fixed = np.r_[np.zeros(lens), np.repeat(kept, _TERMS) / _FIXED**2]
-    information = np.diag(fixed)
-    information[:lens, :lens] = usual.information[:lens, :lens]
-    if stated:
-        mean[:lens] = vector
-        information[:lens, :lens] = np.eye(lens) / _FIXED**2
-    return LensPrior(mean, information)

@@ -114,12 +114,7 @@ def solve_pose_pairs(
     start, scale = quick_fit(pairs[rows], mount, scale_known)
     own_camera = corners is not None or not of_board
     in_order = pairs[np.sort(rows)]
-    try:
-        require_agreement(in_order, mount, scale_known, start, own_camera)
-    except InputError as error:
-        if corners and (cause := corners.contradiction()):
-            raise InputError(f"{cause}. With it, {error}") from None
-        raise
+    _require_agreement(in_order, mount, scale_known, start, corners, own_camera)
     lens = None
     if corners:
         refined = _by_corners(pairs, rows, mount, scale_known, corners)
@@ -166,6 +161,23 @@ def solve_pose_pairs(
         corners=corners,
         lens=lens,
     )
+
+
+def _require_agreement(
+    pairs: PosePairs,
+    mount: MountName,
+    scale_known: bool,
+    start: Agreement,
+    corners: BoardCorners | None,
+    own_camera: bool,
+) -> None:
+    """Check that pairs agree; intrinsics that the corners contradict are named first."""
+    try:
+        require_agreement(pairs, mount, scale_known, start, own_camera)
+    except InputError as error:
+        if corners and (cause := corners.contradiction()):
+            raise InputError(f"{cause}. With it, {error}") from None
+        raise
 
 
 def _by_corners(
