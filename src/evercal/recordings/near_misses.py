@@ -36,9 +36,10 @@ def what_it_lacks(root: Path) -> str:
         return _kind_of(root, "a file, not a folder, and no bag")
     for folder in image_folders(root):
         return _beside(root, folder)
-    first = next(filter(_kind_of, sorted(root.glob("*"))), None)
-    if first:
-        return f"no images; {first.name} is {_kind_of(first)}"
+    for path in sorted(root.glob("*")):
+        kind = _kind_of(path)
+        if kind and not kind.startswith("no images"):
+            return f"no images; {path.name} is {kind}"
     return (
         "no known scene format, no images; give a bag, or a folder that holds images and"
         f" {_WITHOUT}, scene.json, transforms.json, sparse/0 or meta/info.json"

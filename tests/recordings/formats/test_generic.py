@@ -79,7 +79,7 @@ def test_interrupted_recording_has_no_scene_file(tmp_path: Path) -> None:
     with suppress(RuntimeError), generic.SceneWriter(tmp_path, "x") as writer:
         writer.add(make_recording().train[0], "train")
         raise RuntimeError("plug pulled")
-    refused("no known scene format", load_recording, tmp_path)
+    refused("images without poses; add", load_recording, tmp_path)
 
 
 def test_writer_refuses_existing_scenes_and_repeated_names(tmp_path: Path) -> None:
@@ -212,6 +212,5 @@ def test_formats_are_recognised(tmp_path: Path) -> None:
     message = "use one of generic, 7scenes"
     refused(message, load_recording, root, format="gopro")
     refused("no such folder", load_recording, tmp_path / "b")
-    refused("a file, not a folder", load_recording, root / "scene.json")
-    message = r"no known scene format; expected scene\.json"
-    refused(message, load_recording, root / "images")
+    for part in (generic.FILE, "images"):
+        refused("a part of a recording; give", load_recording, root / part)

@@ -71,7 +71,7 @@ _HARMLESS = re.compile(
 )
 """Names of numbers that do not change where a point lies in the image."""
 LENS = re.compile(
-    r"disto|^dist(?!an)|coef|radial|tangent|^lens(?!pos|name|id|serial)|lenses|warp|aberr"
+    r"disto|^dist(?!an)|(?<!intrinsic)coef|radial|tangent|^lens(?!pos|name|id|serial)|lenses|warp|aberr"
 )
 """Names of numbers that do, whatever else the name says."""
 

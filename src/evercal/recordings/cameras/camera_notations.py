@@ -41,7 +41,7 @@ def entries_of(text: str) -> JsonObject:
     """Nested entries of a text in one of the notations; ValueError for other text."""
     body = re.sub(r"\A(\s*#.*\n)+", "", text)
     start = body.lstrip()[:1]
-    if start == "<":
+    if re.match(r"\s*<[?!\w]", body):
         return _of_xml(text)
     rows = [row.groupdict() for row in _REALSENSE.finditer(text)]
     for name, model, width, height, words in _COLMAP.findall(text):
