@@ -38,7 +38,7 @@ from evercal.processes import one_product_thread
 from evercal.progress import OnProgress
 from evercal.recordings import posed_recording
 from evercal.recordings.frame import (
-    MIN_GRIPPER_FRAMES,
+    MIN_TRAIN_FRAMES,
     Frame,
     Recording,
     lacks_camera_poses,
@@ -83,7 +83,7 @@ def learn_held_thing(
     whole = [in_full_size(*pair) for pair in zip(moving, frames, strict=True)]
     start = _start(recording, moving, whole, contents.encoder, on_progress)
     posed = in_windows(start.posed(recording, moving), whole, start)
-    budget = replace(MemoryBudget.parse(None), least=MIN_GRIPPER_FRAMES)
+    budget = replace(MemoryBudget.parse(None), least=MIN_TRAIN_FRAMES)
     options = MapOptions().for_hand_eye(EYE_TO_HAND)
     options = replace(
         options,

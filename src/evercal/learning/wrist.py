@@ -20,7 +20,7 @@ from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.progress import OnProgress
 from evercal.recordings.fixed_pixels import without_fixed_pixels
-from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Recording
+from evercal.recordings.frame import MIN_TRAIN_FRAMES, Recording
 from evercal.recordings.held_out import HeldOutSplit, split_held_out
 from evercal.robot.mount import EYE_IN_HAND
 
@@ -50,7 +50,7 @@ def learn_wrist(
     split = split_held_out(posed.train)
     if len(split.held_out) < LEAST_ANSWERS:
         split = HeldOutSplit(posed.train, ())
-    budget = replace(budget, least=MIN_GRIPPER_FRAMES)
+    budget = replace(budget, least=MIN_TRAIN_FRAMES)
     options = replace(options.for_hand_eye(EYE_IN_HAND), arm=start.arm)
     learned = learn_posed(posed, split, contents, budget, options, on_progress)
     report = learned.report(contents, began, fixed_share)

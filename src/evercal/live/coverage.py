@@ -11,7 +11,7 @@ import numpy as np
 
 from evercal.classes import frozen, frozen_arrays
 from evercal.geometry import SE3, pose_distance
-from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Frame
+from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame
 from evercal.recordings.pictures import sharpness
 from evercal.typing import Array, ArrayPair, Image, Strings
 
@@ -122,7 +122,7 @@ def coverage(
     rotations = _axes(f"about the {mover}'s", rotation_spreads, ROTATION_DEG)
     positions = _axes("along the base's", position_spreads, POSITION_MM)
     rank = int((principal_spreads >= ROTATION_DEG).sum())
-    ready = len(good) >= MIN_GRIPPER_FRAMES and rank >= 2
+    ready = len(good) >= MIN_TRAIN_FRAMES and rank >= 2
     missing = _missing(len(good), rank, rotations, positions)
     state = f"can be {use}" if ready else f"cannot be {use} yet"
     verdict = f"{len(good)} of {len(rows)} images are good; the recording {state}."
@@ -191,8 +191,8 @@ def _missing(
     positions: Sequence[AxisCoverage],
 ) -> Strings:
     missing = []
-    if good < MIN_GRIPPER_FRAMES:
-        missing.append(f"{_more(MIN_GRIPPER_FRAMES - good)} to start with")
+    if good < MIN_TRAIN_FRAMES:
+        missing.append(f"{_more(MIN_TRAIN_FRAMES - good)} to start with")
     # Two axes of rotation are necessary, the third one makes the result better.
     rotations_left = _uncovered(rotations)
     if rank < 2 and not rotations_left:
@@ -204,7 +204,7 @@ def _missing(
         for axis in axes:
             wanted = f"{axis.spread:.0f} {unit}, {least:.0f} wanted"
             missing.append(f"{what} {axis.name} ({wanted})")
-    if MIN_GRIPPER_FRAMES <= good < IMAGES:
+    if MIN_TRAIN_FRAMES <= good < IMAGES:
         missing.append(_more(IMAGES - good))
     return tuple(missing)
 

@@ -19,10 +19,8 @@ from evercal.typing import Floats, Image, Strings
 if TYPE_CHECKING:
     from evercal.robot.arm import Arm
 
-MIN_TRAIN_FRAMES = 16
-"""Minimum number of training frames with a camera pose for learning a scene."""
-MIN_GRIPPER_FRAMES = 8
-"""The same with gripper poses: a few views around one place."""
+MIN_TRAIN_FRAMES = 8
+"""Minimum number of training frames with a pose: a few views around one place."""
 
 
 @dataclass(frozen=True, eq=False)

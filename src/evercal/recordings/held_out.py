@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 EVERY = 100
 """Training frames from the start of one block of held-out frames to the next."""
+FEWEST = 16
+"""Recordings of fewer frames are learned whole."""
 BLOCK = 4
 """Frames of a block, consecutive."""
 Named = TypeVar("Named", bound="Recording | RecordingAt")
@@ -29,7 +31,7 @@ class HeldOutSplit:
     train: tuple[Frame, ...]
     held_out: tuple[Frame, ...]
     """Frames that the scatter of the stated poses is fitted to: 4 consecutive ones in every 100,
-    and at least 4. A recording with fewer than `MIN_TRAIN_FRAMES` frames has none."""
+    and at least 4. A recording with fewer than `FEWEST` frames has none."""
 
 
 def split_held_out(frames: Sequence[Frame]) -> HeldOutSplit:
@@ -38,7 +40,7 @@ def split_held_out(frames: Sequence[Frame]) -> HeldOutSplit:
     Neighbours in a video share their errors. Single frames that are spread over a short recording
     make no better map (research/trust.md).
     """
-    if len(frames) < MIN_TRAIN_FRAMES:
+    if len(frames) < FEWEST:
         return HeldOutSplit(tuple(frames), ())
     every = min(EVERY, len(frames))
     middle = every // 2
@@ -78,10 +80,10 @@ def named_recording(recording: Named, name: str | None, taken: Iterable[str]) ->
     return replace(recording, name=name)
 
 
-def require_frames(recording: Recording, least: int = MIN_TRAIN_FRAMES) -> None:
+def require_frames(recording: Recording) -> None:
     """Refuse a recording with too few training frames."""
-    if len(recording.train) < least:
+    if len(recording.train) < MIN_TRAIN_FRAMES:
         raise InputError(
             f"scene {recording.name!r}: {len(recording.train)} training frames are too few; give at"
-            f" least {least}"
+            f" least {MIN_TRAIN_FRAMES}"
         )

@@ -11,7 +11,6 @@ from evercal.classes import frozen
 from evercal.geometry import SE3, Camera, norms, pose_distance
 from evercal.geometry.near import near_training
 from evercal.recordings.frame import (
-    MIN_GRIPPER_FRAMES,
     MIN_TRAIN_FRAMES,
     Frame,
     Recording,
@@ -210,9 +209,9 @@ def _camera_line(camera: Camera) -> str:
 def _frame_warnings(
     train: int, test: int, untracked: int, owner: Owner
 ) -> Iterator[str]:
-    least = MIN_GRIPPER_FRAMES if owner == "gripper" else MIN_TRAIN_FRAMES
-    if train < least:
-        yield f"{train} training frames with a pose; learning takes {least} or more"
+    if train < MIN_TRAIN_FRAMES:
+        more = f"learning takes {MIN_TRAIN_FRAMES} or more"
+        yield f"{train} training frames with a pose; {more}"
     if not test and owner != "gripper":
         yield "no test frame with a pose; 'evercal evaluate' has nothing to measure on"
     total = train + test + untracked

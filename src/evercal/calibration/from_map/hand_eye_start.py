@@ -34,7 +34,6 @@ from evercal.mapping.arm_offsets import has_joints, with_offsets
 from evercal.mapping.selection import spread_poses
 from evercal.progress import OnProgress
 from evercal.recordings.frame import (
-    MIN_GRIPPER_FRAMES,
     Frame,
     Recording,
     stated_grippers,
@@ -113,7 +112,7 @@ def scene_from_parent(frames: Sequence[Frame], mount: Mount) -> SE3:
 def gripper_frames(recording: Recording) -> tuple[Frame, ...]:
     """Training frames with a gripper pose; too few are refused."""
     frames = tuple(f for f in recording.train if f.base_from_gripper)
-    require_frames(replace(recording, train=frames), MIN_GRIPPER_FRAMES)
+    require_frames(replace(recording, train=frames))
     if stale := stale_frames(frames):
         raise InputError(f"{recording.name}: {stale}")
     return frames

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from evercal.calibration.from_map.image_pairs import ImagePair, image_pairs
 from evercal.features.encoder import load_encoder
 from evercal.geometry import SE3, spread
-from evercal.recordings.frame import MIN_GRIPPER_FRAMES, Recording
+from evercal.recordings.frame import MIN_TRAIN_FRAMES, Recording
 from evercal.robot.arm import Arm
 from evercal.robot.joint_search import JointVerdict, joint_search
 from evercal.robot.joint_test import JointTest, PairMotions, chords
@@ -66,7 +66,7 @@ def recorded_joints(recording: Recording, mount: Mount) -> JointVerdict | None:
     """Compare the joint values of a recording with some of its images; None without both."""
     frames = [f for f in recording.train if f.base_from_gripper and f.joints_rad]
     frames = [frames[i] for i in spread(len(frames), FRAMES)]
-    if not recording.arm or len(frames) < MIN_GRIPPER_FRAMES:
+    if not recording.arm or len(frames) < MIN_TRAIN_FRAMES:
         return None
     pairs = image_pairs(frames, mount, load_encoder())
     values = np.array([frame.joints_rad for frame in frames])

@@ -26,7 +26,7 @@ from evercal.geometry import (
     pose_distance,
     spread,
 )
-from evercal.recordings.frame import MIN_GRIPPER_FRAMES
+from evercal.recordings.frame import MIN_TRAIN_FRAMES
 from evercal.typing import Array, BoolArray, Floats, IntArray, Triple
 
 
@@ -138,7 +138,7 @@ def open_position(
     None if a few images would improve it little. Without a rough `gripper_from_camera`, distances
     of the scene are from the gripper.
     """
-    if len(recorded) < MIN_GRIPPER_FRAMES:
+    if len(recorded) < MIN_TRAIN_FRAMES:
         return None
     mount, scene_m, known = _known(recorded, gripper_from_camera)
     covariance = np.linalg.inv(known)

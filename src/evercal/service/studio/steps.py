@@ -5,7 +5,7 @@ from typing import Literal
 
 from evercal.errors import with_options
 from evercal.live.coverage import IMAGES
-from evercal.recordings.frame import MIN_GRIPPER_FRAMES
+from evercal.recordings.frame import MIN_TRAIN_FRAMES
 from evercal.service.studio.studio import Studio
 
 State = tuple[Literal["waits", "to do", "done"], str]
@@ -80,7 +80,7 @@ def _hold(studio: Studio) -> State:
         return "to do", covered.verdict
     return "to do", (
         "Calibrates the fixed camera without a scene. The gripper holds a textured thing, such as a"
-        f" box or a book, and turns it by 20° and more about two axes: {MIN_GRIPPER_FRAMES} images"
+        f" box or a book, and turns it by 20° and more about two axes: {MIN_TRAIN_FRAMES} images"
         f" or more, better {IMAGES}."
     )
 
