@@ -52,7 +52,7 @@ def test_planted_faults_are_reported() -> None:
         (SE3(rotations, 1000 * translations), "millimetres"),
         (SE3(rotations, 0.001 * translations), "in metres"),
         (TRAIN[np.random.default_rng(0).permutation(200)], "in order and in metres"),
-        (TRAIN[:5], "16 or more"),
+        (TRAIN[:5], "8 or more"),
     ):
         assert message in warned(recording_of(train, TEST))
     assert "test frames have the pose" in warned(recording_of(TRAIN, TRAIN[:40]))
