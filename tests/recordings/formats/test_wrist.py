@@ -71,7 +71,7 @@ def test_names_pair_in_any_order() -> None:
     poses = some_poses(3)
     rows = RobotPoses(("c", "rgb/a.png", "gone.png"), None, poses)
     images = [Path(f"rgb/{name}") for name in ("a.png", "b.png", "c.png")]
-    (a, b, c), notes = pair_images(images, rows, None, Path("poses.csv"))
+    (a, b, c), _, notes = pair_images(images, rows, None, Path("poses.csv"))
     assert_pose(a, poses[1])
     assert b is None
     assert_pose(c, poses[0])
@@ -116,7 +116,7 @@ def test_frame_numbers_and_folders_are_paired_in_order() -> None:
     rows = RobotPoses(None, TIMES[:3], some_poses(3))
     for images in (["0.png", "1.png", "2.png"], ["b/1.png", "b/2.png", "a/1.png"]):
         files = [*map(Path, images)]
-        paired, notes = pair_images(files, rows, None, Path("p"))
+        paired, _, notes = pair_images(files, rows, None, Path("p"))
         assert None not in paired
         assert "in order" in notes[0]
 
@@ -126,7 +126,7 @@ def test_poses_are_interpolated_at_times_in_image_names() -> None:
     poses = SE3.exp(np.outer(np.arange(11), screw))
     images = [Path(f"{TIMES[0] + t:.6f}.png") for t in (-0.1, 0.25, 0.5, 0.975)]
     rows = RobotPoses(None, TIMES, poses)
-    paired, notes = pair_images(images, rows, None, Path("p.tum"))
+    paired, _, notes = pair_images(images, rows, None, Path("p.tum"))
     assert paired[0] is None
     assert notes[1].startswith("1 image taken outside the recorded poses")
     for pose, at in zip(paired[1:], (2.5, 5.0, 9.75), strict=True):

@@ -236,7 +236,7 @@ def test_the_poses_of_visp_are_read_by_role(tmp_path: Path) -> None:
     camera = read_robot_poses(tmp_path, robot=False)
     assert np.max(pose_distance(camera.poses, ARM[::-1])) < 1e-9
     images = [Path(f"image-{i:03d}.png") for i in range(1, 6)]
-    poses, notes = pair_images(images, read, None, tmp_path)
+    poses, _, notes = pair_images(images, read, None, tmp_path)
     assert (
         np.max(pose_distance(SE3.stack([p for p in poses if p is not None]), ARM))
         < 1e-9

@@ -21,7 +21,7 @@ from evercal.recordings.frame import Frame, Recording
 from evercal.recordings.images import IMAGE_ENDINGS, files_in, first_size
 from evercal.recordings.poses.conventions import pose_convention, poses_from_numbers
 from evercal.recordings.poses.joint_tables import read_joint_poses
-from evercal.recordings.poses.pairing import pair_images, pair_joints
+from evercal.recordings.poses.pairing import pair_images
 from evercal.recordings.poses.robot_poses import (
     POSE_ENDINGS,
     RobotPoses,
@@ -143,8 +143,7 @@ def _frames(root: Path, layout: RecordingLayout, options: ReadOptions) -> Record
     file = root / layout.camera
     rows, notes = _rows(root, source, options, layout.convention)
     stamps = _stamps(root)
-    poses, more = pair_images(images, rows, stamps, source)
-    joints = pair_joints(images, rows, stamps, source)
+    poses, joints, more = pair_images(images, rows, stamps, source)
     if file.name == "sensor.yaml":
         with named_errors(file, "camera file"):
             stated = camera_file.fields_of(file).get("T_BS")
@@ -160,9 +159,8 @@ def _frames(root: Path, layout: RecordingLayout, options: ReadOptions) -> Record
     split = layout.images.rpartition("rgb")[0]
     frames = []
     for image, camera, pose, values in zip(images, cameras, poses, joints, strict=True):
-        has_joints = values is not None or rows.joints is None
-        if pose and has_joints:
-            angles = None if values is None else tuple(values.tolist())
+        if pose and values is not None:
+            angles = tuple(values.tolist()) or None
             frame = Frame(split + image.name, image, camera, None, joints_rad=angles)
             frames.append(replace(frame, **{owner: pose}))
     lost = len(images) - len(frames)

@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PureWindowsPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,8 +22,14 @@ from evercal.storage.text_files import (
 )
 from evercal.typing import Array, BoolArray, Strings
 
-Pairing = tuple[list[SE3 | None], list[str]]
-"""The pose of each image, if it has one, and notes."""
+
+class Pairing(NamedTuple):
+    """What n images were paired with; None for images without a row, or in a gap."""
+
+    poses: list[SE3 | None]
+    joints: list[Array | None]
+    """(k,) values of the joints of the arm; none are stated with poses."""
+    notes: list[str]
 
 
 def pair_images(
@@ -32,18 +38,29 @@ def pair_images(
     stamps_s: Mapping[str, float] | None,
     file: Path,
 ) -> Pairing:
-    """Find the pose of every image.
+    """Find the pose, and the joint values, of every image.
 
     Rows with names are paired with the images of these names. Rows with times are interpolated at
     the image times `stamps_s`, by name, or the times in the image names. Otherwise rows and images,
     in natural order, are paired in order, and their numbers must be equal.
     """
+    joints = rows.joints
+    if joints is None:
+        joints = np.empty((len(rows), 0))
     if rows.names is not None:
         numbers, notes = _by_name(images, rows.names, file)
-        return _of_rows(rows.poses, numbers), notes
+        return Pairing(_of_rows(rows.poses, numbers), _of_rows(joints, numbers), notes)
     times = _image_times(images, rows, stamps_s)
     if times is not None and rows.stamps_s is not None:
-        return _by_time(times, PoseTrack(rows.stamps_s, rows.poses), file)
+        poses, valid = PoseTrack(rows.stamps_s, rows.poses).at(times)
+        notes = _notes_of_times(times, valid, rows.stamps_s, file)
+        values = np.empty((len(times), joints.shape[1]))
+        is_known = np.ones(len(times), bool)
+        for column, positions in enumerate(joints.T):
+            moved, is_valid = interpolate(rows.stamps_s, positions, times)
+            values[:, column] = moved
+            is_known &= is_valid
+        return Pairing(_where(poses, valid), _where(values, is_known), notes)
     if len(rows.poses) != len(images):
         remedy = "a stamps.csv (image, stamp_s)"
         if rows.stamps_s is None:
@@ -61,29 +78,8 @@ def pair_images(
                 f" ambiguous; give the folder, or name the images in a column image"
             )
     ends = f"{images[0].name} to {images[-1].name}"
-    return list(rows.poses), [f"images and poses were paired in order, {ends}"]
-
-
-def pair_joints(
-    images: Sequence[Path],
-    rows: RobotPoses,
-    stamps_s: Mapping[str, float] | None,
-    file: Path,
-) -> list[Array | None]:
-    """Joint values (k,) of every image, paired as its pose; None without any, or in a gap."""
-    values = rows.joints
-    if values is None:
-        return [None] * len(images)
-    if rows.names is not None:
-        numbers, _ = _by_name(images, rows.names, file)
-        return _of_rows(values, numbers)
-    times = _image_times(images, rows, stamps_s)
-    if times is None or rows.stamps_s is None:
-        return list(values)
-    stamps = rows.stamps_s
-    columns = [interpolate(stamps, column, times) for column in values.T]
-    moved, valid = zip(*columns, strict=True)
-    return _where(np.transpose(moved), np.all(valid, 0))
+    note = f"images and poses were paired in order, {ends}"
+    return Pairing(list(rows.poses), list(joints), [note])
 
 
 def poses_of_images(
@@ -91,11 +87,11 @@ def poses_of_images(
 ) -> tuple[SE3, list[str]]:
     """Read (n,) base_from_gripper of n images, with notes, for the commands with `--convention`."""
     rows = read_robot_poses(file, convention, option="`convention`")
-    paired, notes = pair_images(images, rows, None, file)
+    paired = pair_images(images, rows, None, file)
     names = _names(images)
     poses = []
     missing = []
-    for name, pose in zip(names, paired, strict=True):
+    for name, pose in zip(names, paired.poses, strict=True):
         if not pose:
             missing.append(name)
         else:
@@ -105,7 +101,7 @@ def poses_of_images(
         raise InputError(
             f"{file}: has no pose for {listed}; add it or leave the image out"
         )
-    return SE3.stack(poses), notes
+    return SE3.stack(poses), paired.notes
 
 
 def unpaired(images: Sequence[str], rows: Sequence[str], file: str) -> list[str]:
@@ -186,16 +182,15 @@ def _are_names(starts: Sequence[str]) -> bool:
     return is_unique and not is_number(starts[0])
 
 
-def _by_time(times: Array, track: PoseTrack, file: Path) -> Pairing:
-    """Poses interpolated at the times of images; None outside of the track and in its gaps."""
-    poses, valid = track.at(times)
+def _notes_of_times(
+    times: Array, valid: BoolArray, stamps_s: Array, file: Path
+) -> list[str]:
+    """What is said of images (n,) at times of which some are valid (n,)."""
     if not valid.any():
-        first = track.stamps_s[0]
-        last = track.stamps_s[-1]
         raise InputError(
             f"{file}: no image was taken while poses were recorded: images at {times.min():.3f} to"
-            f" {times.max():.3f} s, poses at {first:.3f} to {last:.3f} s; are the clocks the same?"
-            f" If not, name the image of each row in a column image"
+            f" {times.max():.3f} s, poses at {stamps_s.min():.3f} to {stamps_s.max():.3f} s; are"
+            f" the clocks the same? If not, name the image of each row in a column image"
         )
     notes = [f"poses were interpolated at the times of {counted(len(times), 'image')}"]
     if not valid.all():
@@ -204,7 +199,7 @@ def _by_time(times: Array, track: PoseTrack, file: Path) -> Pairing:
             f"{invalid} taken outside the recorded poses or in a gap of more than {MAX_GAP_S:g} s"
             f" with motion"
         )
-    return _where(poses, valid), notes
+    return notes
 
 
 def _image_times(
