@@ -23,6 +23,7 @@ from evercal.recordings.cameras.camera_file import read_camera
 from evercal.recordings.formats import lerobot, wrist
 from evercal.recordings.formats.lerobot_poses import pose_feature
 from evercal.recordings.poses.joint_tables import read_joints
+from evercal.robot.joint_map import JointMap
 
 from .checks import assert_pose
 
@@ -51,7 +52,7 @@ RECORDINGS = {
 }
 SINGLE_FILES = {
     "joints.csv", "joints.json", "camera.txt", "touched.csv", "picks.csv", "base_from_camera.txt",
-    "pusht/meta/info.json", "layout.csv",
+    "pusht/meta/info.json", "layout.csv", "joint_map.json",
 }  # fmt: skip
 CAMERAS = {
     "camera.json", "camera_info.yaml", "camera_opencv.yaml", "camera_opencv.json",
@@ -161,6 +162,13 @@ def test_joint_tables(page: Path) -> None:
         assert rows.names == ("image-1.png", "image-2.png")
         np.testing.assert_allclose(rows.values[:, :2], [[0.12, -1.53], [0.18, -1.49]])
     assert wrist.detect(page)
+
+
+def test_joint_maps(page: Path) -> None:
+    read = JointMap.read(page / "joint_map.json")
+    assert read.joints == ("wrist_flex", "elbow_flex", "wrist_roll")
+    values = read.values(np.full((1, len(read.columns)), 10.0))
+    np.testing.assert_allclose(np.rad2deg(values), [[80, 20, 20]])
 
 
 def test_lerobot_description(page: Path) -> None:
