@@ -59,6 +59,7 @@ VERBS = {
         "recording_mistakes",
         "mistakes in the stated poses of recordings that are learned",
     ),
+    "refusals": ("refusals", "the refusals of some folders, with examples of tests"),
     "pnp": ("pnp", "poses from matches with outliers, beside other solvers"),
     "refresh": ("changing_room", "a map in a rendered room that changes in ten rounds"),
     "same-answers": ("same_answers", "answers of this tree, beside a commit's"),
