@@ -32,7 +32,7 @@ class Frame:
     image: Picture
     camera: Camera
     """Intrinsics at the size of `image`."""
-    base_from_camera: SE3 | None
+    base_from_camera: SE3 | None = None
     """Camera pose in the base frame, if stated."""
     base_from_gripper: SE3 | None = None
     """Gripper pose in the robot's base frame at the time of the image, if there is an arm."""
@@ -129,9 +129,11 @@ def with_images(recording: Recording, folder: Path) -> Recording:
     relative = partial(os.path.relpath, start=folder)
     names = [*map(relative, lost.values())]
     note = lost_images(names, len(files), map(relative, unused))
-    train = tuple(frame for frame in recording.train if frame.name not in lost)
-    test = tuple(frame for frame in recording.test if frame.name not in lost)
-    return replace(recording, train=train, test=test, notes=(*recording.notes, note))
+    kept = []
+    for frames in (recording.train, recording.test):
+        kept.append(tuple(frame for frame in frames if frame.name not in lost))
+    notes = (*recording.notes, note)
+    return replace(recording, train=kept[0], test=kept[1], notes=notes)
 
 
 def lost_images(lost: Sequence[str], total: int, unused: Iterable[str] = ()) -> str:

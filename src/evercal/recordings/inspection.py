@@ -10,6 +10,7 @@ import numpy as np
 from evercal.classes import frozen
 from evercal.geometry import SE3, Camera, norms, pose_distance
 from evercal.geometry.near import near_training
+from evercal.recordings.cameras.camera_fields import off_centre
 from evercal.recordings.frame import (
     MIN_TRAIN_FRAMES,
     Frame,
@@ -221,12 +222,10 @@ def _frame_warnings(
 
 def _camera_warnings(camera: Camera) -> Iterator[str]:
     name = f"camera {camera.width}x{camera.height}"
-    right = (camera.cx + 0.5) / camera.width
-    below = (camera.cy + 0.5) / camera.height
     half_view = np.arctan(camera.width / (2 * camera.fx))
     view = np.rad2deg(2 * half_view)
     size = "are the intrinsics those of this image size?"
-    if max(abs(right - 0.5), abs(below - 0.5)) > 0.2:
+    if off_centre(camera) > 0.2:
         point = f"({camera.cx:.0f}, {camera.cy:.0f})"
         yield f"{name}: principal point {point} is far from the middle; {size}"
     if not 20 < view < 150:

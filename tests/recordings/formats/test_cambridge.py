@@ -100,9 +100,13 @@ def test_impossible_positions_and_lost_images_are_untracked(shop: Path) -> None:
         (
             "dataset_test.txt",
             "a\nb\n\nx.png 1 2 3",
-            "line 1 is not 'image X Y Z W P Q R'",
+            "first line is not 'image X Y Z W P Q R'",
         ),
-        ("dataset_test.txt", "a\nb\n\nx.png 1 2 3 4 5 6 nan", "line 1 is not 'image"),
+        (
+            "dataset_test.txt",
+            "a\nb\n\nx.png 1 2 3 4 5 6 nan",
+            "row 1, column 'R': 'nan' is not",
+        ),
         ("dataset_test.txt", "a\nb\n\nx.png 1 2 3 0 0 0 0", "a quaternion of length"),
         ("dataset_test.txt", "a\nb\n\n../x.png 1 2 3 1 0 0 0", "stays inside"),
         ("dataset_*.txt", "a\nb\n\n", "name no image"),

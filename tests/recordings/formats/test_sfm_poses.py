@@ -72,7 +72,7 @@ def test_poses_are_replaced_and_other_frames_dropped(
     [
         (
             "seq-01/frame-000000.color.png 1 0 0 0 0 nan 0 500",
-            "line 1 is not 'image qw",
+            "row 1, column 'ty': 'nan' is not a finite number",
         ),
         ("seq-01/frame-000000.color.png 1 0 0 0 0 0 0 -5", "camera fx"),
         ("seq-01/frame-000000.color.png 0 0 0 0 0 0 0 500", "SE3 got a quaternion of"),

@@ -69,7 +69,7 @@ _KNOWN = {
     "fisheyemodel",
 }
 """Names of fields that are used, or that may be left out."""
-_CENTRAL = 0.05
+CENTRAL = 0.05
 """Largest distance of a usual principal point from the middle, widths and heights."""
 _PROJECTION = re.compile(r"(.*\.)?(p\d*|prect\d*|proj.*)$")
 """Names of projection matrices, which are for rectified images."""
@@ -331,11 +331,11 @@ def states_size(data: Record) -> bool:
     return not {"image_width", "image_size"}.isdisjoint(map(field_name, data))
 
 
-def is_central(camera: Camera) -> bool:
-    """Whether the principal point is near the middle of the image."""
+def off_centre(camera: Camera) -> float:
+    """Distance of the principal point from the middle of the image, widths or heights."""
     right = (camera.cx + 0.5) / camera.width
     down = (camera.cy + 0.5) / camera.height
-    return max(abs(right - 0.5), abs(down - 0.5)) < _CENTRAL
+    return max(abs(right - 0.5), abs(down - 0.5))
 
 
 def refuse_misfit(camera: Camera) -> None:

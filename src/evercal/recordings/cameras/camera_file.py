@@ -12,8 +12,9 @@ from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.recordings.cameras.camera_blocks import cameras_of
 from evercal.recordings.cameras.camera_fields import (
+    CENTRAL,
     camera_of,
-    is_central,
+    off_centre,
     refuse_misfit,
     states_size,
 )
@@ -97,7 +98,7 @@ def camera_from_fields(
         with naming(place) if len(entries) > 1 else nullcontext():
             camera = camera_of(entry, size)
         cameras[place] = camera
-        if camera.size == size and (states_size(entry) or is_central(camera)):
+        if camera.size == size and (states_size(entry) or off_centre(camera) < CENTRAL):
             fitting[camera] = place
     choice = fitting or {camera: place for place, camera in cameras.items()}
     first = next(iter(choice))

@@ -67,14 +67,14 @@ def pixels_of_view(fields: Record, size: Size) -> JsonObject:
         fit = str(fields.get("sensorfit", "AUTO"))
         across = {"HORIZONTAL": width, "VERTICAL": height}.get(fit, max(size))
         if fit == "VERTICAL":
-            wide, _ = _pair(view, "aperture_y")
+            wide = _number(view, "aperture_y")
         wide *= width / across
         high = 0.0
     elif not wide:
-        wide = 2 * _tangent(_pair(view, "fov_x"))
-        high = 2 * _tangent(_pair(view, "fov_y" if "fov_y" in view else "fov"))
+        wide = 2 * _tangent(_number(view, "fov_x"))
+        high = 2 * _tangent(_number(view, "fov_y" if "fov_y" in view else "fov"))
     elif not isinstance(view["aperture"], list):
-        high, _ = _pair(view, "aperture_y")
+        high = _number(view, "aperture_y")
     wide = wide or high * width / height
     high = high or wide * height / width
     if not wide * high > 0:
@@ -82,17 +82,22 @@ def pixels_of_view(fields: Record, size: Size) -> JsonObject:
     fx = focal[0] / wide * width
     fy = focal[1] / high * height
     right, down = _pair(view, "centre")
-    cx = (width - 1) / 2 - right - _pair(view, "shift_x")[0] * across
-    cy = (height - 1) / 2 - down + _pair(view, "shift_y")[0] * across
+    cx = (width - 1) / 2 - right - _number(view, "shift_x") * across
+    cy = (height - 1) / 2 - down + _number(view, "shift_y") * across
     pixels = {**fields, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
-    stated = [_pair(view, name)[0] for name in ("cx", "cy", "p2", "p1", "b1")]
-    if max(abs(stated[0] / width), abs(stated[1] / height)) > _FROM_CORNER:
-        pixels |= {"cx": stated[0], "cy": stated[1]}
+    stated = [_number(view, name) for name in ("cx", "cy", "p2", "p1", "b1")]
+    right, down, first, second, b1 = stated
+    if max(abs(right / width), abs(down / height)) > _FROM_CORNER:
+        pixels |= {"cx": right, "cy": down}
     elif "cx" in fields:
         # Metashape: from the middle; its tangential terms are in the other order.
-        pixels |= {"cx": cx + stated[0], "cy": cy + stated[1]}
-        pixels |= {"p1": stated[2], "p2": stated[3], "fx": fx + stated[4]}
+        pixels |= {"cx": cx + right, "cy": cy + down, "fx": fx + b1}
+        pixels |= {"p1": first, "p2": second}
     return pixels
+
+
+def _number(view: Record, name: str) -> float:
+    return _pair(view, name)[0]
 
 
 def _pair(view: Record, name: str, default: float = 0.0) -> Pair:
@@ -105,8 +110,7 @@ def _pair(view: Record, name: str, default: float = 0.0) -> Pair:
         raise ValueError(f"{name} is a number, got {value!r}") from None
 
 
-def _tangent(angles: Pair) -> float:
-    angle = angles[0]
+def _tangent(angle: float) -> float:
     if angle >= _LARGEST_RADIANS:
         angle = math.radians(angle)
     return math.tan(angle / 2)

@@ -71,5 +71,5 @@ def frames_of(
     """Frames of images at (n, k) joint values."""
     frames = []
     for i, (image, row) in enumerate(zip(images, values.tolist(), strict=True)):
-        frames.append(Frame(str(i), image, camera, None, joints_rad=tuple(row)))
+        frames.append(Frame(str(i), image, camera, joints_rad=tuple(row)))
     return tuple(frames)

@@ -55,7 +55,7 @@ def pose_feature(root: Path, info: Record, options: ReadOptions) -> str:
             names = names_of(info, key)
             observed[key] = names
             is_chosen = arm is None or arm in (key, *_arms(names))
-            if is_chosen and _convention_of(names):
+            if is_chosen and _convention_of(_parts(names)):
                 keys.append(key)
     if STATE in keys:
         return STATE
@@ -127,10 +127,11 @@ def _joint_poses(
 def _pose_columns(names: list[str], arm: str | None) -> tuple[str, list[int]]:
     """Name of the convention of a pose, and its columns."""
     arms = _arms(names)
-    chosen = _of_arm(names, arm) if arm in arms else names
-    convention = _convention_of(chosen)
+    if arm not in arms:
+        arm = None
+    last = _parts(names, arm)
+    convention = _convention_of(last)
     parts = _PARTS[convention]
-    last = _last_parts(chosen)
     if any(last.count(part) > 1 for part in parts):
         remedy = "names that tell them apart in info.json"
         prefixes = [*filter(None, arms)]
@@ -140,27 +141,26 @@ def _pose_columns(names: list[str], arm: str | None) -> tuple[str, list[int]]:
     return convention, [last.index(part) for part in parts]
 
 
-def _convention_of(names: list[str]) -> str:
+def _convention_of(parts: list[str]) -> str:
     """Name of the convention of a pose; empty if the numbers are none."""
-    last = set(_last_parts(names))
-    for convention, parts in _PARTS.items():
-        if last.issuperset(parts):
+    for convention, needed in _PARTS.items():
+        if {*needed}.issubset(parts):
             return convention
     return ""
 
 
-def _last_parts(names: list[str]) -> list[str]:
-    return [name.rpartition(".")[2] for name in names]
+def _parts(names: list[str], arm: str | None = None) -> list[str]:
+    """The last part of each name; empty for those of another arm."""
+    parts = []
+    for name in names:
+        prefix, _, last = name.rpartition(".")
+        parts.append(last if arm in (None, prefix) else "")
+    return parts
 
 
 def _arms(names: list[str]) -> list[str]:
     prefixes = dict.fromkeys(name.rpartition(".")[0] for name in names)
-    return [arm for arm in prefixes if _convention_of(_of_arm(names, arm))]
-
-
-def _of_arm(names: list[str], arm: str) -> list[str]:
-    """The names of one arm, others as empty strings."""
-    return [name if name.rpartition(".")[0] == arm else "" for name in names]
+    return [arm for arm in prefixes if _convention_of(_parts(names, arm))]
 
 
 def names_of(info: Record, column: str) -> list[str]:

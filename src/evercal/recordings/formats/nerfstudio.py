@@ -79,17 +79,16 @@ def detect(root: Path) -> bool:
 def load(root: Path, options: ReadOptions) -> Recording:
     """Read the poses and the size of one image of every camera; no other image is opened."""
     file = root if root.is_file() else _file_in(root)
-    frames, test, bad = _frames(file)
+    train, test, bad = _frames(file)
     if file.name == "transforms_train.json" and root.is_dir():
         for split in ("val", "test"):
             other = root / f"transforms_{split}.json"
             if other.is_file():
-                more, _, more_bad = _frames(other)
-                frames += more
-                test.update(frame.name for frame in more)
+                more, others, more_bad = _frames(other)
+                test += more + others
                 bad += more_bad
     with named_errors(file, "nerfstudio file"):
-        names = [frame.name for frame in frames]
+        names = [frame.name for frame in train + test]
         refuse_repeated(names, "keep one entry for each image")
     notes = [frame_note(file.name, options.metres)]
     if bad:
@@ -97,8 +96,8 @@ def load(root: Path, options: ReadOptions) -> Recording:
     folder = root if root.is_dir() else file.parent
     return Recording(
         folder.resolve().name,
-        tuple(frame for frame in frames if frame.name not in test),
-        tuple(frame for frame in frames if frame.name in test),
+        tuple(train),
+        tuple(test),
         bad,
         notes=tuple(notes),
         metric=options.metres,
@@ -112,8 +111,8 @@ def _file_in(root: Path) -> Path:
     return root / FILE
 
 
-def _frames(file: Path) -> tuple[list[Frame], set[str], int]:
-    """Frames of a file, names of test frames, and the number of frames that are marked as bad."""
+def _frames(file: Path) -> tuple[list[Frame], list[Frame], int]:
+    """Training and test frames of a file, and the number of frames that are marked as bad."""
     data = read_json(file, "nerfstudio file", "export it again")
     with named_errors(file, "nerfstudio file"):
         undo, scale = _applied(data)
@@ -143,8 +142,11 @@ def _frames(file: Path) -> tuple[list[Frame], set[str], int]:
             with naming(f"frame {i}"):
                 frames.append(_frame(root, data, entry, undo, scale))
         names = [str(entry.get("file_path")) for entry in (*entries, *tested)]
-        test = _test_names(root, data, names).union(names[len(entries) :])
-    return _resized(file, frames), test, bad
+        tests = _test_names(root, data, names).union(names[len(entries) :])
+    splits: tuple[list[Frame], list[Frame]] = ([], [])
+    for frame in _resized(file, frames):
+        splits[frame.name in tests].append(frame)
+    return *splits, bad
 
 
 def _image_root(file: Path, name: str) -> Path:

@@ -88,9 +88,8 @@ def load(root: Path, options: ReadOptions) -> Recording:
     frames = []
     for i in np.flatnonzero(poses.valid).tolist():
         joints = poses.stated.joints_of(i)
-        frame = Frame(f"{i:06d}", shots[i], camera, None, joints_rad=joints)
-        pose = {f"base_from_{poses.owner}": poses.stated.poses[i]}
-        frames.append(replace(frame, **pose))
+        pose: JsonObject = {f"base_from_{poses.owner}": poses.stated.poses[i]}
+        frames.append(Frame(f"{i:06d}", shots[i], camera, joints_rad=joints, **pose))
     lost = len(shots) - len(frames)
     if lost:
         notes.append(

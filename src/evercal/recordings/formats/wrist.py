@@ -32,6 +32,7 @@ from evercal.recordings.read_options import ReadOptions
 from evercal.robot.frame_names import FrameNames
 from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import named_errors, read_json, refuse_repeated
+from evercal.typing import JsonObject
 
 
 class RecordingLayout(NamedTuple):
@@ -161,8 +162,8 @@ def _frames(root: Path, layout: RecordingLayout, options: ReadOptions) -> Record
     for image, camera, pose, values in zip(images, cameras, poses, joints, strict=True):
         if pose and values is not None:
             angles = tuple(values.tolist()) or None
-            frame = Frame(split + image.name, image, camera, None, joints_rad=angles)
-            frames.append(replace(frame, **{owner: pose}))
+            own: JsonObject = {owner: pose, "joints_rad": angles}
+            frames.append(Frame(split + image.name, image, camera, **own))
     lost = len(images) - len(frames)
     name = root.resolve().name
     notes = (*notes, *more)

@@ -6,6 +6,7 @@ A reading fits if its rotations are rotations and its units are plausible, as wh
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 from evercal.recordings.poses.conventions import (
@@ -44,16 +45,12 @@ Read = Callable[[PoseConvention], Any]
 """Reads a `PoseTable` of numbers in a convention; ValueError if they are not of it."""
 
 
-def undefined(
-    problem: str, names: Sequence[str], read: Read, most: int = 2
-) -> ValueError:
+def undefined(problem: str, names: Sequence[str], read: Read) -> ValueError:
     """An error that offers the first readings that fit, or says what poses are."""
     offers: list[str] = []
-    for name in _fitting(names, read):
+    for name in islice(_fitting(names, read), 2):
         remark = _REMARKS.get(name.partition(":")[0])
         offers.append(f"{name} ({remark})" if remark else name)
-        if len(offers) == most:
-            break
     if offers:
         return ConventionError(problem, " or ".join(offers))
     return ValueError(

@@ -15,11 +15,7 @@ from evercal.recordings.poses.conventions import (
 )
 from evercal.recordings.poses.likely_readings import WITHOUT_HEADER, undefined
 from evercal.recordings.poses.pose_columns import POSITIONS, PoseTable, named_numbers
-from evercal.recordings.poses.row_files import (
-    Names,
-    in_unit,
-    text_cells,
-)
+from evercal.recordings.poses.row_files import Names, in_unit
 from evercal.typing import Array
 
 
@@ -76,8 +72,7 @@ def _under_header(numbers: Array, given: PoseConvention, names: Names) -> PoseTa
         raise ValueError(
             f"rows have {width} numbers, and {len(words)} columns are stated; write ... for others"
         )
-    cells = text_cells(map(repr, row) for row in numbers.tolist())
-    table = named_numbers(words, cells, given)
+    table = named_numbers(words, numbers.astype(object), given)
     return table if names is None else table._replace(names=names)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from evercal.geometry import rotation_error
 from evercal.recordings.poses.conventions import Given
 from evercal.recordings.poses.pose_columns import HEADERS, PoseTable, named_numbers
-from evercal.recordings.poses.row_files import name_and_unit, number_array, text_cells
+from evercal.recordings.poses.row_files import name_and_unit, number_array
 from evercal.typing import Array, Record
 
 Columns = Record
@@ -85,8 +85,7 @@ def composed_poses(
         words += ["rx", "ry", "rz"]
     rotations = _rows(rotations, width)
     numbers = np.concatenate([translations, rotations], -1)
-    cells = text_cells(map(repr, row) for row in numbers.tolist())
-    return named_numbers(words, cells, given)
+    return named_numbers(words, numbers.astype(object), given)
 
 
 def _rows(array: Array, width: int) -> Array:

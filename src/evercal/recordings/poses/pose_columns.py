@@ -196,6 +196,7 @@ def named_numbers(words: Sequence[str], rows: Cells, given: Given) -> PoseTable:
     """
     require_at_most(len(words), "columns", "columns")
     groups = groups_of(words)
+    plain = plain_names(words)
     free = [*words]
     for column in chain.from_iterable(groups.values()):
         free[column] = ""
@@ -203,11 +204,11 @@ def named_numbers(words: Sequence[str], rows: Cells, given: Given) -> PoseTable:
     if not given or given.base == OF_COLUMNS:
         name, problem, offers = _defined(groups, words)
         if problem:
-            unknown = {*plain_names([free[i] for i in others])}
-            if groups.keys() == {"position"} and unknown.issubset(_INDICES):
+            unknown = [i for i in others if free[i] and plain[i] not in _INDICES]
+            if groups.keys() == {"position"} and not unknown:
                 problem = f"the columns {', '.join(words)} {POSITIONS}"
                 raise ValueError(problem)
-            problem += f" (first row: {' '.join(rows[0, :8])})"
+            problem += f" (first row: {' '.join(map(str, rows[0, :8]))})"
             raise undefined(problem, offers, partial(named_numbers, words, rows))
         modifiers = given.name.split(":")[1:] if given else []
         given = pose_convention(":".join([name, *modifiers]))
@@ -217,7 +218,6 @@ def named_numbers(words: Sequence[str], rows: Cells, given: Given) -> PoseTable:
     for key, group in groups.items():
         columns = columns or HEADERS[key].ordered(group, convention)
     if not groups:
-        plain = plain_names(words)
         others = [i for i in others if plain[i] not in _INDICES]
         if not position and not convention.is_matrix:
             position = others[:3]

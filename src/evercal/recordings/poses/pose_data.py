@@ -181,15 +181,14 @@ def _of_object(data: Columns, given: Given, robot: bool) -> PoseTable:
             return table
     if has_position([*_cells(_flat(columns))]):
         return pose_data([columns], given, robot)
-    lists = []
-    for value in columns.values():
+    lists = {}
+    for key, value in columns.items():
         if isinstance(value, Mapping):
-            value = [value[key] for key in sorted(value, key=natural_key)]
-        lists.append(value)
-    if {*map(type, lists)} != {list} or not has_position([*columns]):
+            value = [value[number] for number in sorted(value, key=natural_key)]
+        lists[key] = value
+    if {*map(type, lists.values())} != {list} or not has_position([*columns]):
         raise _unclear([], data)
-    rows = _rows_of(dict(zip(columns, lists, strict=True)))
-    return pose_data(rows, given, robot)
+    return pose_data(_rows_of(lists), given, robot)
 
 
 def _rows_of(columns: Columns) -> list[JsonObject]:
@@ -283,14 +282,12 @@ def _of_arrays(columns: Columns, given: Given, plural: bool) -> PoseTable | None
 
 def _labelled(table: PoseTable, columns: Columns, plural: bool) -> PoseTable:
     """A table with the image names and stamps of the columns that hold one value a pose."""
-    keys = []
-    lists = []
+    lists = {}
     for key, value in columns.items():
         if len(nested_shape(value)) == 1:
-            keys.append(key)
-            lists.append(value)
+            lists[key] = value
     count = len(table.numbers)
-    names, stamps, _ = row_labels(keys, lists, count, plural)
+    names, stamps, _ = row_labels([*lists], [*lists.values()], count, plural)
     if table.stamps_s is not None:
         stamps = table.stamps_s
     return table._replace(names=table.names or names, stamps_s=stamps)

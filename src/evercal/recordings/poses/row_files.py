@@ -20,7 +20,7 @@ from evercal.storage.text_files import named_errors, read_text
 from evercal.typing import Array, Strings
 
 Cells = NDArray[np.object_]
-"""(n, k) str, each of its own length."""
+"""(n, k) str, each of its own length, or numbers."""
 Names = Strings | None
 
 _NAMES = (
@@ -95,14 +95,14 @@ def read_rows(path: Path, contents: str) -> LabelledRows:
 
 def numbers_by_image(text: str, layout: str) -> dict[str, list[float]]:
     """Numbers of lines that begin with the name of an image, by that name."""
-    rows = {}
-    for number, line in enumerate(filter(str.strip, text.splitlines()), start=1):
-        name, *words = line.split()
-        numbers = list(map(float, filter(is_number, words)))
-        if len(numbers) != len(layout.split()) - 1 or not np.isfinite(numbers).all():
-            raise ValueError(f"line {number} is not {layout!r}: {line[:60]!r}")
-        rows[name] = numbers
-    return rows
+    cells = table_cells(text.splitlines())
+    if not cells.size:
+        return {}
+    _, *words = layout.split()
+    if cells.shape[1] != len(words) + 1:
+        raise ValueError(f"its first line is not {layout!r}")
+    numbers = cell_numbers(cells[:, 1:], words)
+    return dict(zip(cells[:, 0], numbers.tolist(), strict=True))
 
 
 def table_cells(lines: Sequence[str]) -> Cells:
@@ -204,7 +204,7 @@ def cell_numbers(cells: Cells, words: Sequence[str] = ()) -> Array:
         name = repr(words[column]) if words else column + 1
         where = f"row {row + 1}, column {name}"
         problem = f"{str(cell)!r} is not a finite number"
-        if "[" in cell:
+        if "[" in str(cell):
             problem += "; write all poses with brackets, or none"
         raise ValueError(f"{where}: {problem}")
     return cells.astype(float)
