@@ -183,8 +183,9 @@ def format_of(root: Path, stated: FormatName | None = None) -> FormatName:
 
 def _refuse(root: Path) -> NoReturn:
     """Say what a file or folder lacks to be a recording."""
-    inside = [path for path in sorted(root.glob("*")) if recognised(path)]
-    inside = inside or [path for path in sorted(root.glob("*/*")) if recognised(path)]
+    inside: list[Path] = []
+    for pattern in ("*", "*/*"):
+        inside = inside or [*filter(recognised, sorted(root.glob(pattern)))]
     names = " or ".join(map(str, inside[:4]))
     if len(inside) == 1:
         names += f", or move what it holds to {root}"

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from evercal.geometry import spread
 from evercal.recordings.frame import Frame
 from evercal.typing import Array, Image, Strings
 
@@ -38,8 +39,7 @@ def look_at(frames: Sequence[Frame]) -> Pictures:
     """Look at some images of a recording, in recorded order."""
     if not frames:
         return Pictures((), usable=True)
-    spread = np.linspace(0, len(frames) - 1, _LOOKED_AT)
-    chosen = np.unique(spread.round().astype(int))
+    chosen = spread(len(frames), _LOOKED_AT)
     images = [_small(frames[i].read_image()) for i in chosen]
     blank = [image for image in images if is_blank(image)]
     if blank:

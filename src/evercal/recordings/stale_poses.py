@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from evercal.geometry import SE3
+from evercal.geometry import SE3, spread
 from evercal.recordings.frame import Frame, stated_grippers
 from evercal.recordings.pictures import changes
 from evercal.typing import IntArray
@@ -44,8 +44,8 @@ def stale_frames(frames: Sequence[Frame]) -> str:
     """Describe frames whose gripper pose is the same while their images change."""
 
     def moved(rows: IntArray) -> bool:
-        chosen = rows[np.linspace(0, len(rows) - 1, _SEEN).astype(int)]
-        seen = changes([frames[i] for i in np.unique(chosen)])
+        chosen = rows[spread(len(rows), _SEEN)]
+        seen = changes([frames[i] for i in chosen])
         return bool(np.median(seen) > _CHANGED)
 
     names = [frame.name for frame in frames]

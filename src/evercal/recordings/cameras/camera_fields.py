@@ -239,15 +239,12 @@ def _matrix(fields: Record, data: Record) -> Array:
     names = ("fx", "fy", "cx", "cy")
     if "camera_matrix" in fields:
         numbers = numbers_of(fields["camera_matrix"], "camera_matrix")
-        if len(numbers) == 4:
-            fx, fy, cx, cy = numbers
-            # As Kalibr writes it; other orders differ in the first two.
-            if 0.8 * fy < fx < 1.25 * fy:
-                return _matrix_of(fx, fy, cx, cy)
-        if len(numbers) == 16:
-            last = [0, 0, 0, 1]
-            if numbers[12:] == last and numbers[3::4] == last:
-                numbers = np.reshape(numbers, (4, 4))[:3, :3].ravel().tolist()
+        # As Kalibr writes it; other orders differ in the first two.
+        if len(numbers) == 4 and 0.8 * numbers[1] < numbers[0] < 1.25 * numbers[1]:
+            return _matrix_of(*numbers)
+        last = [0, 0, 0, 1]
+        if len(numbers) == 16 and numbers[12:] == last and numbers[3::4] == last:
+            numbers = np.reshape(numbers, (4, 4))[:3, :3].ravel().tolist()
         numbers = numbers_of(numbers, "camera_matrix", 9)
         matrix = np.reshape(numbers, (3, 3))
         if matrix[2, :2].any() and not matrix[:2, 2].any():

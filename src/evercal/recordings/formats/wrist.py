@@ -133,8 +133,11 @@ def _layouts(root: Path) -> list[RecordingLayout]:
             tables.append(RecordingLayout(name))
     if tables:
         return tables
-    with_poses = [layout for layout in LAYOUTS if (root / layout.poses).exists()]
-    return [layout for layout in with_poses if (root / layout.images).is_dir()]
+    layouts = []
+    for layout in LAYOUTS:
+        if (root / layout.poses).exists() and (root / layout.images).is_dir():
+            layouts.append(layout)
+    return layouts
 
 
 def _frames(root: Path, layout: RecordingLayout, options: ReadOptions) -> Recording:
