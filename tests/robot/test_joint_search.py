@@ -88,7 +88,7 @@ SINGLE = {
     "normalised": ("hobby", percent(LOW, HIGH), ["values are normalised"]),
 }  # fmt: skip
 """Arm, what is done to its values, and what is said."""
-QUICK = ("sense 5", "sense of a slide", "zero of the lift", "J3 with J2")
+QUICK = ("sense of a slide", "J3 with J2")
 
 
 def verdict(kind: str, change: Change, seed: int, mount: Mount) -> JointVerdict:

@@ -1,12 +1,11 @@
 """`joint_search`: the reading of joint values that explains the motions between images.
 
 Tried are the sense and the zero of each joint, units, the order of columns, couplings of joints
-and normalised values; one mistake, two, and then any sense, zero and range of all joints.
+and normalised values. Each round adds a mistake to the best readings of the last one.
 """
 
 import re
-from collections.abc import Iterator
-from itertools import permutations
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from evercal.robot.arm import Arm
 from evercal.robot.joint_map import UNITS
 from evercal.robot.joint_test import FREEDOM, OFFSET, SPREAD, JointTest
-from evercal.typing import Array, Strings
+from evercal.typing import Array, IntArray, Strings
 
 AGREE_DEG = 2.0
 """Median difference of rotations up to which joint values agree with the images."""
@@ -42,17 +41,17 @@ _CLOSE = 0.12
 """The same for refined readings."""
 _REFINED = 16
 """Number of readings that are refined."""
-_RANDOM = 2000
-"""Number of random readings."""
+_ROUNDS = 3
+"""Largest number of mistakes, besides the unit."""
 _COUPLED = 2
 """Largest distance along the arm of joints that are coupled."""
 _TURN = 2 * np.pi
-_SIZES = {
-    "rad": (0.0, 2 * _TURN),
-    "deg": (_TURN, 2 * 360.0),
-    "steps": (360.0, 4096.0),
-}
-"""Largest value that angles in a unit may have."""
+_ZEROS = _TURN / 8 * np.arange(1, 8)
+"""Zeros that are tried."""
+_LEAST = 0.3
+"""Largest angle of an arm, at least, radians."""
+_SPAN = 100.0
+"""Normalised values are between minus and plus this."""
 _WORDS = {
     "deg": "in degrees",
     "steps": "in steps of the motor, 4096 a turn",
@@ -91,18 +90,20 @@ class JointVerdict(NamedTuple):
 
 def joint_search(test: JointTest) -> JointVerdict:
     """Compare joint values with images; where they differ, search what explains them."""
-    same = _same(test.arm)
-    stated = _judged(test, test.refined(same[None], _CLOSE, 10)[0])
+    stated = _judged(test, test.refined(_same(test.arm)[None], _CLOSE)[0])
     fits = stated.error_deg < AGREE_DEG and stated.direction_deg < _DIRECTION_DEG
     if fits and not stated.mistakes:
         return JointVerdict(stated, [])
     limit = _BETTER * stated.cost
     if fits or stated.mistakes:
         limit = stated.cost
+    changes = _changes(test.arm)
+    tried = _bases(test)
     found: list[Explained] = []
-    for most, tried in _attempts(test):
+    for most in range(1, _ROUNDS + 2):
+        tried, readings = _best(test, tried)
         simple = False
-        for reading in _best(test, tried):
+        for reading in readings:
             one = _judged(test, reading)
             if one.cost < limit and one.error_deg < _FOUND_DEG:
                 found.append(one)
@@ -110,19 +111,25 @@ def joint_search(test: JointTest) -> JointVerdict:
                 simple |= explains and len(one.mistakes) <= most
         if simple:
             break
+        tried = _composed(tried, changes)
+    return JointVerdict(stated, _simplest(found))
+
+
+def _simplest(found: list[Explained]) -> list[Explained]:
+    """Those of the fewest mistakes that fit equally well, one of each kind."""
     least = min((one.cost for one in found), default=0.0)
     equal = [one for one in found if one.cost < least + _EQUAL]
-    simplest = min(map(_complexity, equal), default=0)
-    distinct: dict[str, Explained] = {}
+    fewest = min(map(_complexity, equal), default=0)
+    kinds: dict[str, Explained] = {}
     for one in sorted(equal, key=lambda one: one.cost):
-        if _complexity(one) == simplest:
+        if _complexity(one) == fewest:
             kind = re.sub(r"is \d+ deg", "", "; ".join(one.mistakes))
             # Small offsets are estimated with the map.
             small = np.abs(one.reading[:, OFFSET]) < np.deg2rad(_LARGE_DEG)
-            small &= ~one.reading[:, FREEDOM].astype(bool)
+            small &= one.reading[:, FREEDOM] == 0
             one.reading[small, OFFSET] = 0.0
-            distinct.setdefault(kind, one)
-    return JointVerdict(stated, list(distinct.values()))
+            kinds.setdefault(kind, one)
+    return list(kinds.values())
 
 
 def _complexity(one: Explained) -> float:
@@ -130,34 +137,19 @@ def _complexity(one: Explained) -> float:
     return len(one.mistakes) + 0.1 * str(one.mistakes).count("zero")
 
 
-def _attempts(test: JointTest) -> Iterator[tuple[int, Array]]:
-    """Readings (h, k, k + 3) with few mistakes first, and the number of mistakes at most."""
-    single = _singles(test.arm)
-    bases = _bases(test)
-    for base in bases:
-        yield 1, _composed(base[None], single)
-    for base in bases:
-        yield 2, _composed(_composed(base[None], single), single)
-    for base in bases:
-        yield 99, _random(test.arm, base)
-
-
 def _judged(test: JointTest, reading: Array) -> Explained:
     """A reading with what the images and its mistakes cost."""
     mistakes = described(test.arm, reading)
-    (error, direction) = test.errors_deg(reading[None])[0].tolist()
-    cost = float(test.costs(reading[None], _CLOSE)[0])
-    cost += _OF_MISTAKE * len(mistakes)
-    return Explained(reading, error, direction, cost, mistakes)
+    cost = float(test.costs(reading[None], _CLOSE)[0]) + _OF_MISTAKE * len(mistakes)
+    return Explained(reading, *test.errors_deg(reading), cost, mistakes)
 
 
-def _best(test: JointTest, readings: Array) -> Array:
-    """The best readings, refined; the first one is among them."""
-    costs = test.costs(readings, _WIDE)
-    costs[0] = 0.0
-    rows = np.argsort(costs, kind="stable")[:_REFINED]
-    near = test.refined(readings[rows], _WIDE, 8)
-    return test.refined(near, _CLOSE, 8)
+def _best(test: JointTest, readings: Array) -> tuple[Array, Array]:
+    """The best readings, and the same refined, without those that become alike."""
+    rows = np.argsort(test.costs(readings, _WIDE), kind="stable")[:_REFINED]
+    best = test.refined(test.refined(readings[rows], _WIDE), _CLOSE)
+    _, first = np.unique(np.round(best, 2), axis=0, return_index=True)
+    return readings[rows[first]], best[first]
 
 
 def _same(arm: Arm) -> Array:
@@ -177,81 +169,71 @@ def _composed(first: Array, second: Array) -> Array:
     return composed.reshape(-1, *first.shape[1:])
 
 
-def _singles(arm: Arm) -> Array:
+def _changes(arm: Arm) -> Array:
     """The stated reading, and all changes of one kind."""
     same = _same(arm)
     count = len(same)
     changes = [same]
+
+    def change(joint: int, column: int, factor: float, offset: float = 0.0) -> None:
+        changed = same.copy()
+        changed[joint, column] = factor
+        changed[joint, OFFSET] = offset
+        if offset:
+            changed[joint, SPREAD] = _ANY
+        changes.append(changed)
+
     turning = arm.rotates() & arm.free()
     for joint in range(count):
-        change = same.copy()
-        change[joint, joint] = -1
-        changes.append(change)
-        for angle in _TURN / 8 * np.arange(1, 8) * turning[joint]:
-            change = same.copy()
-            change[joint, OFFSET] = angle
-            change[joint, SPREAD] = _ANY
-            changes.append(change)
-    for first, second in permutations(range(count), 2):
-        change = same.copy()
-        if first < second:
-            change[[first, second], :OFFSET] = same[[second, first], :OFFSET]
-            changes.append(change.copy())
-        if abs(second - first) <= _COUPLED:
-            for sign in (1, -1):
-                change = same.copy()
-                change[first, second] = sign
-                changes.append(change)
-    reversed_order = same.copy()
-    reversed_order[:, :OFFSET] = same[::-1, :OFFSET]
-    return np.array([*changes, reversed_order])
+        change(joint, joint, -1.0)
+        for angle in _ZEROS * turning[joint]:
+            change(joint, joint, 1.0, angle)
+        for other in range(max(joint - _COUPLED, 0), min(joint + _COUPLED + 1, count)):
+            if other != joint:
+                change(joint, other, 1.0)
+                change(joint, other, -1.0)
+    orders = [np.arange(count)[::-1]]
+    for first, second in combinations(range(count), 2):
+        order = np.arange(count)
+        order[[first, second]] = second, first
+        orders.append(order)
+    for order in orders:
+        changed = same.copy()
+        changed[:, :OFFSET] = same[order, :OFFSET]
+        changes.append(changed)
+    return np.array(changes)
 
 
-def _bases(test: JointTest) -> list[Array]:
-    """Readings of all values in one unit, as far as the sizes of the values allow it."""
+def _bases(test: JointTest) -> Array:
+    """Readings in which all values have a unit that makes them angles, or are normalised."""
     same = _same(test.arm)
     turns = test.arm.rotates()
     sizes = np.abs(test.values).max(0) * turns
-    largest = sizes.max()
-    scales = []
-    for unit, (least, most) in _SIZES.items():
-        if least <= largest < most:
-            scales.append(np.where(turns, UNITS[unit], 1.0))
-    if largest > _TURN:
-        scales.append(np.where(sizes > _TURN, UNITS["deg"], 1.0))
-    if largest < 2 * _TURN * UNITS["deg"]:
-        scales.append(np.where(turns, 1 / UNITS["deg"], 1.0))
-    bases = []
-    for scale in scales:
-        base = same.copy()
-        base[:, :OFFSET] *= scale[:, None]
-        # The zero of a motor is in the middle of its steps.
-        base[:, OFFSET] = np.where(scale == UNITS["steps"], -_TURN / 2, 0.0)
-        bases.append(base)
-    lower, middle, upper = np.broadcast_to(test.arm.ranges, (len(same), 3)).T
-    for span in (100.0, 1.0):
-        if span / 4 < largest < 1.2 * span:
+    degrees = np.full(len(same), UNITS["deg"])
+    bases = [same]
+    for scale in (
+        degrees,
+        np.where(sizes > _TURN, degrees, 1.0),
+        np.full(len(same), UNITS["steps"]),
+        1 / degrees,
+    ):
+        if _LEAST < (sizes * scale).max() < 2 * _TURN:
             base = same.copy()
-            half = np.minimum((upper - lower) / 2, _TURN / 2) / span
-            base[:, :OFFSET] *= np.where(turns, half, 1.0)[:, None]
-            base[:, OFFSET] = middle * turns * test.arm.free()
-            base[:, SPREAD] = np.where(turns, _ANY * test.arm.free(), same[:, SPREAD])
-            base[:, FREEDOM] = _RANGES * turns
+            base[turns, :OFFSET] *= scale[turns, None]
+            # The zero of a motor is in the middle of its steps.
+            base[scale == UNITS["steps"], OFFSET] = -_TURN / 2
             bases.append(base)
-    return bases
-
-
-def _random(arm: Arm, base: Array) -> Array:
-    """Readings with random senses, zeros and, where they are unknown, ranges."""
-    rng = np.random.default_rng(0)
-    free = arm.rotates() & arm.free()
-    tried = np.tile(base, (_RANDOM, 1, 1))
-    shape = (_RANDOM, len(base), 1)
-    tried[..., :OFFSET] *= np.exp(base[:, FREEDOM:] * rng.normal(0, 1, shape))
-    tried[..., :OFFSET] *= rng.choice([-1.0, 1.0], shape)
-    tried[..., OFFSET] = free * rng.uniform(-np.pi, np.pi, shape[:2])
-    tried[..., SPREAD] = np.where(free, _ANY, base[:, SPREAD])
-    return tried
+    if _SPAN / 4 < sizes.max() < 1.2 * _SPAN:
+        lower, middle, upper = np.broadcast_to(test.arm.ranges, (len(same), 3)).T
+        base = same.copy()
+        half = np.minimum((upper - lower) / 2, _TURN / 2) / _SPAN
+        base[turns, :OFFSET] *= half[turns, None]
+        free = turns & test.arm.free()
+        base[free, OFFSET] = middle[free]
+        base[free, SPREAD] = _ANY
+        base[turns, FREEDOM] = _RANGES
+        bases.append(base)
+    return np.array(bases)
 
 
 def described(arm: Arm, reading: Array) -> Strings:
@@ -260,22 +242,23 @@ def described(arm: Arm, reading: Array) -> Strings:
     sizes = np.abs(matrix)
     # A value of its own column counts more than those that are coupled to it.
     columns = (sizes + np.diag(np.diag(sizes))).argmax(1)
+    moved = np.flatnonzero(columns != np.arange(len(columns)))
     found = []
-    moved = [arm.joints[i] for i, column in enumerate(columns) if i != column]
-    if moved:
-        found.append(f"the columns of joints {', '.join(moved)} are in another order")
-    units: dict[str, list[str]] = {}
-    for joint, factor in zip(arm.joints, sizes.max(1), strict=True):
-        units.setdefault(unit_of(factor), []).append(joint)
+    if moved.size:
+        found.append(f"the columns of joints {_names(arm, moved)} are in another order")
+    units = np.array([unit_of(factor) for factor in sizes.max(1)])
     normalised = "" in units
     if normalised:
-        units = {"": list(arm.joints)}
-    for unit, joints in units.items():
-        if unit in _WORDS:
-            whose = "values are"
-            if len(joints) < len(columns):
-                whose = f"values of joints {', '.join(joints)} are"
-            found.append(f"{whose} {_WORDS[unit]}")
+        units[:] = ""
+    for unit, words in _WORDS.items():
+        joints = np.flatnonzero(units == unit)
+        whose = "values are"
+        if joints.size < len(units):
+            whose = f"values of joints {_names(arm, joints)} are"
+        if joints.size:
+            found.append(f"{whose} {words}")
+    zeros = reading[:, OFFSET] + _TURN / 2 * ("steps" in units)
+    far = np.rad2deg(np.abs((zeros + np.pi) % _TURN - np.pi))
     for i, joint in enumerate(arm.joints):
         main = matrix[i, columns[i]]
         if main < 0:
@@ -288,17 +271,18 @@ def described(arm: Arm, reading: Array) -> Strings:
             found.append(
                 f"joint {joint} is coupled to {by}: it stands at its value {word} that of {by}"
             )
-        middle = _TURN / 2 * ("steps" in units)
-        offset = (reading[i, OFFSET] + middle + np.pi) % _TURN - np.pi
-        degrees = abs(np.rad2deg(offset))
-        if degrees > _LARGE_DEG and not normalised:
-            found.append(f"the zero of joint {joint} is {degrees:.0f} deg off")
+        if far[i] > _LARGE_DEG and not normalised:
+            found.append(f"the zero of joint {joint} is {far[i]:.0f} deg off")
     return tuple(found)
+
+
+def _names(arm: Arm, joints: IntArray) -> str:
+    return ", ".join(arm.joints[i] for i in joints)
 
 
 def unit_of(factor: float) -> str:
     """The unit of a factor to radians; empty if it is none."""
-    for unit in _SIZES:
+    for unit in ("rad", "deg", "steps"):
         if abs(np.log(factor / UNITS[unit])) < 0.01:
             return unit
     return ""

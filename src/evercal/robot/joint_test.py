@@ -37,9 +37,11 @@ _POSITION_M = {True: 0.2, False: 2.0}
 _PRIOR = 1e-3
 """Weight of a deviation of parameters by one standard deviation."""
 _STEP = 1e-4
-"""Step of numerical derivatives, standard deviations."""
+"""Step of numerical derivatives."""
+_ITERATIONS = 8
+"""Number of iterations of a refinement."""
 _LARGEST_STEP = 0.5
-"""Largest change of an offset or of the logarithm of a factor in an iteration."""
+"""Largest change of an offset, radians, or of the logarithm of a factor in an iteration."""
 
 
 class PairMotions(NamedTuple):
@@ -164,94 +166,66 @@ class JointTest:
             )[:, None]
         return moved + (lever @ position)[..., 0]
 
+    def saturated(self, readings: Array, cap: float) -> Array:
+        """(h, m) residuals of h readings, each divided so that its size is below 1."""
+        residuals = self.residuals(readings)
+        squares = (residuals**2).sum(3, keepdims=True)
+        count = 2 * len(self.ends)
+        scaled = residuals / np.sqrt((squares + cap**2) * count)
+        return scaled.reshape(len(readings), -1)
+
     def costs(self, readings: Array, cap: float) -> Array:
         """(h,) mean of squares that saturate at `cap`."""
         costs = []
-        for start in range(
-            0,
-            len(readings),
-            _AT_ONCE,
-        ):
-            some = self.residuals(readings[start : start + _AT_ONCE])
-            costs.append(
-                saturated(
-                    some,
-                    cap,
-                )
-            )
+        for some in np.array_split(readings, 1 + len(readings) // _AT_ONCE):
+            costs.append((self.saturated(some, cap) ** 2).sum(1))
         return np.concatenate(costs)
 
-    def errors_deg(self, readings: Array) -> Array:
-        """(h, 2) median differences of rotations, and of directions."""
-        medians = np.median(
-            norms(self.residuals(readings)),
-            2,
-        )
-        return np.rad2deg(medians) / (1, _OF_DIRECTIONS)
+    def errors_deg(self, reading: Array) -> tuple[float, float]:
+        """Median differences of rotations, and of directions."""
+        medians = np.median(norms(self.residuals(reading[None])[0]), 1)
+        turned, aside = np.rad2deg(medians).tolist()
+        return turned, aside / _OF_DIRECTIONS
 
-    def refined(self, readings: Array, cap: float, iterations: int) -> Array:
-        """Readings after the refinement of offsets and factors: Levenberg-Marquardt."""
-        spread = readings[:, :, SPREAD:].reshape(len(readings), -1)
-        used = np.flatnonzero(spread.any(0))
-        change = np.zeros_like(spread)
-        largest = _LARGEST_STEP / np.maximum(spread, 1e-9)
-        prior = _PRIOR * np.eye(len(used))
-        damping = np.full(len(spread), 1e-2)
-        residuals = self.residuals(readings)
-        cost = saturated(residuals, cap)
-        for _ in range(iterations):
+    def refined(self, readings: Array, cap: float) -> Array:
+        """Readings with offsets and factors that fit best: Levenberg-Marquardt, all at once."""
+        spread = readings[:, :, SPREAD:]
+        used = spread.any(0)
+        prior = np.sqrt(_PRIOR) / np.maximum(spread[:, used], _STEP)
+
+        def moved(change: Array) -> Array:
+            both = np.zeros(spread.shape)
+            both[:, used] = change
+            changed = readings.copy()
+            changed[..., :OFFSET] *= np.exp(both[..., 1:])
+            changed[..., OFFSET] += both[..., 0]
+            return changed
+
+        def errors(change: Array) -> Array:
+            seen = self.saturated(moved(change), cap)
+            return np.concatenate([seen, prior * change], 1)
+
+        best = np.zeros(prior.shape)
+        least = errors(best)
+        damping = np.ones((len(best), 1, 1))
+        identity = np.eye(used.sum())
+        for _ in range(_ITERATIONS):
             slopes = []
-            for parameter in used:
-                step = change.copy()
-                step[:, parameter] += _STEP
-                moved = self.residuals(_moved(readings, step))
-                slopes.append((moved - residuals) / _STEP)
-            slope = np.stack(slopes, -1).reshape(len(spread), -1, len(used))
-            squares = (residuals**2).sum(3, keepdims=True)
-            factor = (cap / (squares + cap**2)) ** 2 / squares[0].size
-            weighted = slope * (factor + 0 * residuals).reshape(len(spread), -1, 1)
-            curvature = weighted.swapaxes(1, 2) @ slope + prior
-            size = np.trace(curvature, axis1=1, axis2=2) / max(len(used), 1)
-            curvature += (damping * size)[:, None, None] * np.eye(len(used))
-            sides = (weighted * residuals.reshape(len(spread), -1, 1)).sum(1)
-            sides += _PRIOR * change[:, used]
-            step = np.zeros_like(spread)
-            step[:, used] = np.linalg.solve(curvature, sides[..., None])[..., 0]
-            trial = change - step.clip(-largest, largest)
-            moved = self.residuals(_moved(readings, trial))
-            trial_cost = saturated(moved, cap) + _PRIOR * (trial**2).sum(1)
-            better = trial_cost < cost
-            change[better] = trial[better]
-            residuals[better] = moved[better]
-            cost[better] = trial_cost[better]
-            damping *= np.where(better, 0.25, 8.0)
-        return _moved(readings, change)
-
-
-def _moved(readings: Array, change: Array) -> Array:
-    """Readings after a change (h, 2 k) of offsets and factors, standard deviations."""
-    moved = readings.copy()
-    change = change.reshape(*readings.shape[:2], 2) * readings[..., SPREAD:]
-    moved[..., :OFFSET] *= np.exp(change[..., 1:])
-    moved[..., OFFSET] += change[..., 0]
-    return moved
+            for step in _STEP * identity:
+                slopes.append((errors(best + step) - least) / _STEP)
+            sides = np.stack(slopes, 1)
+            curvature = sides @ sides.swapaxes(1, 2) + damping * identity
+            step = np.linalg.solve(curvature, sides @ least[..., None])[..., 0]
+            trial = best - step.clip(-_LARGEST_STEP, _LARGEST_STEP)
+            after = errors(trial)
+            better = (after**2).sum(1) < (least**2).sum(1)
+            best[better] = trial[better]
+            least[better] = after[better]
+            damping *= np.where(better, 0.25, 8.0)[:, None, None]
+        return moved(best)
 
 
 def chords(rotations: SE3) -> Array:
     """(..., 3) axis times twice the sine of half the angle, at most half a turn."""
     wxyz = rotations.rotation_wxyz
-    return (
-        2
-        * wxyz[..., 1:]
-        * np.where(
-            wxyz[..., :1] < 0,
-            -1,
-            1,
-        )
-    )
-
-
-def saturated(residuals: Array, cap: float) -> Array:
-    """(h,) mean of squares of residuals (h, 2, p, 3) that saturate at `cap`."""
-    squares = (residuals**2).sum(3)
-    return (squares / (squares + cap**2)).mean((1, 2))
+    return 2 * wxyz[..., 1:] * np.where(wxyz[..., :1] < 0, -1, 1)
