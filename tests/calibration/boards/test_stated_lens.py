@@ -27,7 +27,7 @@ POINTS = {"chessboard": grid(9, 6), "small": grid(9, 6) / 4, "apriltag": square(
 
 
 def views(
-    camera: Camera, kind: str, count: int = 12, noise_px: float = 0.05, seed: int = 3
+    camera: Camera, kind: str, count: int = 7, noise_px: float = 0.05, seed: int = 3
 ) -> dict[str, BoardView]:
     rng = np.random.default_rng(seed)
     board = TAG if kind == "apriltag" else CHESSBOARD
@@ -41,8 +41,8 @@ def views(
 
 
 CASES: list[tuple[Camera, dict, str]] = [
-    (PLAIN, {"fx": 385.0, "fy": 385.6}, f"{MODE}: 620 px fit, not 385"),
-    (PLAIN, {"fx": 690.0, "fy": 691.1}, f"{MODE}: 620 px fit, not 690"),
+    (PLAIN, {"fx": 385.0, "fy": 385.6}, f"{MODE}: fx 620.* fit, not fx 385 "),
+    (PLAIN, {"fx": 690.0, "fy": 691.1}, f"{MODE}: fx 620.* fit, not fx 690 "),
     (PLAIN, {"fx": 930.0, "fy": 931.5}, MODE),
     (PLAIN, {"fx": 4.2, "fy": 4.207}, "its focal length is in millimetres"),
     (PLAIN, {"fx": 6.0, "fy": 6.01}, "its focal length is in millimetres"),
@@ -53,12 +53,12 @@ CASES: list[tuple[Camera, dict, str]] = [
     (
         PLAIN,
         {"fx": 310.0, "fy": 310.5, "cx": 161.15, "cy": 119.05},
-        f"{SIZE}: .* 2 fit",
+        f"{SIZE}, 0.5 times this",
     ),
     (
         PLAIN,
         {"fx": 1240.0, "fy": 1242.0, "cx": 644.6, "cy": 476.2},
-        f"{SIZE}: .* 0.5 fit",
+        f"{SIZE}, 2 times this",
     ),
     (PLAIN, {"fx": 930.0, "fy": 931.5, "cx": 483.4, "cy": 357.2}, SIZE),
     (PLAIN, {"cx": 238.1, "cy": 322.3}, "its x and y are swapped"),
@@ -72,8 +72,7 @@ CASES: list[tuple[Camera, dict, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("true", "change", "words"), CASES)
-def test_the_contradiction_is_named(true: Camera, change: dict, words: str) -> None:
+def check_contradiction(true: Camera, change: dict, words: str) -> None:
     stated = replace(true, **change)
     poses = board_poses(CHESSBOARD, stated, views(true, "chessboard"))
     widened, said = compared_lens(poses)
@@ -93,14 +92,46 @@ def test_the_contradiction_is_named(true: Camera, change: dict, words: str) -> N
     assert np.median(np.array(errors) / np.array(sigmas)) < 2.5
 
 
+@pytest.mark.parametrize(("true", "change", "words"), CASES[::4])
+def test_the_contradiction_is_named(true: Camera, change: dict, words: str) -> None:
+    check_contradiction(true, change, words)
+
+
+@pytest.mark.slow("src/evercal/calibration/boards")
+@pytest.mark.parametrize(("true", "change", "words"), CASES)
+def test_each_contradiction_is_named(true: Camera, change: dict, words: str) -> None:
+    check_contradiction(true, change, words)
+
+
+@pytest.mark.slow("src/evercal/calibration/boards")
 @pytest.mark.parametrize("kind", [*POINTS])
 @pytest.mark.parametrize(("count", "noise_px"), [(3, 0.1), (5, 0.05), (8, 0.3)])
 @pytest.mark.parametrize("true", [PLAIN, BENT], ids=["plain", "bent"])
+def test_exact_files_are_never_accused(
+    kind: str, count: int, noise_px: float, true: Camera
+) -> None:
+    check_exact(kind, count, noise_px, true, 3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "count", "noise_px", "true"),
+    [
+        ("chessboard", 5, 0.05, BENT),
+        ("small", 3, 0.1, PLAIN),
+        ("apriltag", 8, 0.3, BENT),
+    ],
+)
 def test_exact_files_are_not_accused(
     kind: str, count: int, noise_px: float, true: Camera
 ) -> None:
+    check_exact(kind, count, noise_px, true, 1)
+
+
+def check_exact(
+    kind: str, count: int, noise_px: float, true: Camera, seeds: int
+) -> None:
     board = TAG if kind == "apriltag" else CHESSBOARD
-    for seed in range(3):
+    for seed in range(seeds):
         seen = views(true, kind, count, noise_px, seed)
         assert compared_lens(board_poses(board, true, seen))[1] == ""
 

@@ -1,8 +1,6 @@
 """Whether a board contradicts the stated intrinsics of its camera."""
 
-from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -11,10 +9,10 @@ from evercal.calibration.boards.board_poses import (
     BoardPoses,
     board_poses,
 )
-from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.boards.intrinsics import calibrate_camera
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, norms
+from evercal.typing import JsonObject
 
 _WORSE = 1.3
 """Factor by which contradicted intrinsics enlarge the residuals."""
@@ -24,16 +22,10 @@ _EVIDENCE = 45.0
 """Twice the logarithm of the likelihood ratio that nine free intrinsics reach hardly by chance."""
 _FREE = 9
 """Number of free intrinsics."""
+_MILLIMETRES = 20.0
+"""Ratio of focal lengths above which the stated one is in millimetres."""
 _MISFIT_PX = 1.0
 """Noise of corners above which stated intrinsics are doubted where none can be estimated."""
-
-
-class Contradiction(NamedTuple):
-    """A board that contradicts intrinsics."""
-
-    words: str
-    others: BoardPoses | None = None
-    """Board poses by intrinsics from the board."""
 
 
 def compared_lens(stated: BoardPoses) -> tuple[BoardPoses, str]:
@@ -42,82 +34,77 @@ def compared_lens(stated: BoardPoses) -> tuple[BoardPoses, str]:
     Where the board contradicts the stated ones, the covariances contain the difference, and a
     sentence says so; otherwise it is empty.
     """
-    views = {image.name: image.view for image in stated.detected if image.view}
-    found = contradiction(stated, views)
-    if not found or not found.others:
-        return stated, found.words if found else ""
-    others = {image.name: image.camera_from_board for image in found.others.detected}
-    images = [_widened(image, others.get(image.name)) for image in stated.images]
-    return replace(stated, images=tuple(images)), found.words
-
-
-def contradiction(
-    stated: BoardPoses, views: Mapping[str, BoardView]
-) -> Contradiction | None:
-    """What the corners of a board say against the stated intrinsics of its poses, if anything."""
     camera = stated.camera
     sigma = stated.corner_sigma_px
+    views = {image.name: image.view for image in stated.detected if image.view}
     try:
-        estimated = calibrate_camera(
+        own = calibrate_camera(
             list(views.values()), camera.width, camera.height, camera.model
         ).camera
     except InputError:
         if sigma < _MISFIT_PX:
-            return None
-        return Contradiction(
+            return stated, ""
+        return stated, (
             f"corners fit the camera file only to {sigma:.2f} px: check it, or take five images or"
             " more with the board tilted, which tell what is wrong"
         )
-    free = board_poses(stated.board, estimated, views, "board")
+    free = board_poses(stated.board, own, views, "board")
     freedom = sum(2 * len(view.pixels) - 6 for view in views.values()) - _FREE
     ratio = sigma / free.corner_sigma_px
     if ratio < _WORSE or 2 * freedom * np.log(ratio) < _EVIDENCE:
-        return None
+        return stated, ""
+    most = max(_WORSE * free.corner_sigma_px, _REST * sigma)
     cause = ""
-    for words, other in _causes(camera, estimated):
-        fit = board_poses(stated.board, other, views)
-        if fit.corner_sigma_px < max(_WORSE * free.corner_sigma_px, _REST * sigma):
-            cause = f"{words}. C"
+    for words, change in _causes(camera, own).items():
+        repaired = replace(camera, **change)
+        if board_poses(stated.board, repaired, views).corner_sigma_px < most:
+            cause = f"{words}: "
             break
     words = (
-        f"the board contradicts the camera file: {cause or 'c'}orners fit to {sigma:.2f} px with it"
-        f" and to {free.corner_sigma_px:.2f} px without; it moves the corners of the image by"
-        f" {_moved_px(camera, estimated):.0f} px. Check the file, or omit `camera`"
+        f"the board contradicts the camera file: {cause}{_numbers(own)} fit, not"
+        f" {_numbers(camera)}. Corners fit to {sigma:.2f} px with it and to"
+        f" {free.corner_sigma_px:.2f} px without; it moves the corners of the image by"
+        f" {_moved_px(camera, own):.0f} px. Check the file, or omit `camera`"
     )
-    return Contradiction(words, free)
+    others = {image.name: image.camera_from_board for image in free.detected}
+    images = [_widened(image, others.get(image.name)) for image in stated.images]
+    return replace(stated, images=tuple(images)), words
 
 
-def _causes(stated: Camera, own: Camera) -> Iterator[tuple[str, Camera]]:
-    """What may be wrong with stated intrinsics, the simplest first, and the camera without it."""
-    if stated.distortion:
-        yield (
-            "its distortion is applied twice, the images are rectified already",
-            replace(stated, distortion=()),
-        )
-    swapped = replace(stated, fx=stated.fy, fy=stated.fx, cx=stated.cy, cy=stated.cx)
-    yield "its x and y are swapped, as in images that are turned", swapped
+def _causes(stated: Camera, own: Camera) -> dict[str, JsonObject]:
+    """What may be wrong with stated intrinsics, the simplest first, and the right values."""
     scale = own.fx / stated.fx
-    longer = replace(stated, fx=own.fx, fy=stated.fy * scale)
-    size = "its focal length is of another mode or stream"
-    if scale > 20:
-        size = "its focal length is in millimetres"
-    yield f"{size}: {own.fx:.0f} px fit, not {stated.fx:.4g}", longer
-    yield (
-        f"it is of another resolution: fx, fy, cx and cy times {scale:.3g} fit",
-        replace(longer, cx=stated.cx * scale, cy=stated.cy * scale),
+    longer = {"fx": own.fx, "fy": stated.fy * scale}
+    mode = "its focal length is of another mode or stream"
+    if scale > _MILLIMETRES:
+        mode = "its focal length is in millimetres"
+    return {
+        "its distortion is applied twice, the images are rectified already": {
+            "distortion": ()
+        },
+        "its x and y are swapped, as in images that are turned": {
+            "fx": stated.fy,
+            "fy": stated.fx,
+            "cx": stated.cy,
+            "cy": stated.cx,
+        },
+        mode: longer,
+        f"it is of another resolution, {1 / scale:.3g} times this one": {
+            **longer,
+            "cx": stated.cx * scale,
+            "cy": stated.cy * scale,
+        },
+        "its fx is that of squeezed or cropped images": {"fx": own.fx},
+        "its fy is that of squeezed or cropped images": {"fy": own.fy},
+        "its principal point is of another crop": {"cx": own.cx, "cy": own.cy},
+        "its distortion is another": {"distortion": own.distortion},
+    }
+
+
+def _numbers(camera: Camera) -> str:
+    return (
+        f"fx {camera.fx:.4g} fy {camera.fy:.4g} cx {camera.cx:.4g} cy {camera.cy:.4g}"
     )
-    for name, change in (("fx", {"fx": own.fx}), ("fy", {"fy": own.fy})):
-        yield (
-            f"its {name} is that of squeezed or cropped images: fx / fy is"
-            f" {own.fx / own.fy:.3f} by the board, {stated.fx / stated.fy:.3f} in the file",
-            replace(stated, **change),
-        )
-    yield (
-        f"its principal point is of another crop: {own.cx:.0f} {own.cy:.0f} fit, not"
-        f" {stated.cx:.0f} {stated.cy:.0f}",
-        replace(stated, cx=own.cx, cy=own.cy),
-    )
-    yield "its distortion is another", replace(stated, distortion=own.distortion)
 
 
 def _widened(

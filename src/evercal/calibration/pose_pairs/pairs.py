@@ -28,7 +28,7 @@ from evercal.calibration.boards.intrinsics import (
     lens_estimate,
 )
 from evercal.calibration.boards.row_shift import CornerNoise
-from evercal.calibration.boards.stated_lens import contradiction
+from evercal.calibration.boards.stated_lens import compared_lens
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation
 from evercal.classes import frozen_arrays
 from evercal.geometry import SE3, Camera, norms, pose_distance
@@ -255,9 +255,7 @@ class BoardCorners:
         if not self.stated or not self.board:
             return ""
         views = {str(i): view for i, view in enumerate(self.views)}
-        poses = board_poses(self.board, self.camera, views)
-        found = contradiction(poses, views)
-        return found.words if found else ""
+        return compared_lens(board_poses(self.board, self.camera, views))[1]
 
     @property
     def prior(self) -> LensPrior:
