@@ -54,7 +54,6 @@ def tagslam(places: Places) -> Written:
         for name, values in (("position", position(own)), ("rotation", vector)):
             cells = ", ".join(f"{key}: {value:.9f}" for key, value in values.items())
             lines.append(f"        {name}: {{{cells}}}")
-        lines.append(f"        R: [{', '.join(['0.0'] * 36)}]")
     return "\n".join(lines), "yaml"
 
 
@@ -72,16 +71,6 @@ def marker_map(places: Places, per_metre: float = 1.0) -> Written:
 
 def marker_map_in_pixels(places: Places) -> Written:
     return marker_map(places, 8000)
-
-
-def fiducial_slam(places: Places) -> Written:
-    lines = []
-    for number, (pose, _) in places.items():
-        angles = pose.rotation.as_euler("xyz", degrees=True)
-        values = " ".join(f"{value:f}" for value in [*pose.translation_m, *angles])
-        links = " ".join(str(other) for other in places if other != number)
-        lines.append(f"{number} {values} 0.001000 12 {links}")
-    return "\n".join(lines), "txt"
 
 
 def wpilib(places: Places) -> Written:
@@ -226,5 +215,5 @@ SIZED: list[Callable[[Places], Written]] = [
     vectors,
     ros_poses,
 ]
-UNSIZED = [fiducial_slam, wpilib]
+UNSIZED = [wpilib]
 """They state no sides."""

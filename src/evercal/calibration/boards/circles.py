@@ -53,7 +53,9 @@ def find_circles(grey: Image, board: Board) -> Detection:
             plane, _ = cv2.findHomography(pixels, points[:, :2])
             if plane is None or np.linalg.det(plane) < 0:
                 continue
+            plane = np.asarray(plane, float)
             on_board = cv2.perspectiveTransform(pixels[None], plane)[0]
+            on_board = np.asarray(on_board, float)
             away = np.abs(on_board - points[:, :2]).max() / board.size_m
             if away < _MAX_MISFIT:
                 return BoardView(points, _centres(image, on_board, plane))
@@ -75,11 +77,12 @@ def _centres(image: Image, on_board: Array, plane: Array) -> Array:
     window = window[norms(window) < near / 2]
     for _ in range(_ROUNDS):
         at = on_board[:, None] + window
-        pixels = cv2.perspectiveTransform(at, to_image).astype(np.float32)
-        values = cv2.remap(image, pixels, None, cv2.INTER_LINEAR).astype(float)
+        pixels = cv2.perspectiveTransform(at, to_image)
+        u, v = np.moveaxis(np.asarray(pixels, np.float32), -1, 0)
+        values = np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR), float)
         dark, bright = np.percentile(values, _LEVELS, axis=1)[..., None]
         share = (bright - values) / (bright - dark)
         weight = np.clip(share, _EDGE, 1 - _EDGE) - _EDGE
         moved = (weight[..., None] * window).sum(1) / weight.sum(1)[:, None]
         on_board = on_board + moved
-    return cv2.perspectiveTransform(on_board[None], to_image)[0]
+    return np.asarray(cv2.perspectiveTransform(on_board[None], to_image)[0], float)

@@ -7,7 +7,7 @@ intrinsics, see `evercal.calibration.boards.intrinsics`.
 
 from collections.abc import Sequence
 from math import factorial
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -135,19 +135,6 @@ BEND = ("stretch", "shear", *(f"bend {'x' * i}{'y' * j}" for i, j in _POWERS))
 """Names of the terms of a `Bend`."""
 
 
-class Shape(Protocol):
-    """How a board departs from its drawing."""
-
-    @property
-    def terms(self) -> Array:
-        """(b,)."""
-        ...
-
-    def slopes(self, points: Array) -> Array:
-        """Return the (k, 3, b) derivative of points (k, 3) by the terms."""
-        ...
-
-
 class Bend(NamedTuple):
     """How a board departs from its drawing: its columns are stretched and sheared, and it is bent.
 
@@ -200,7 +187,7 @@ def lens_vector(camera: Camera) -> Array:
 
 
 def board_pose(
-    view: BoardView, camera: Camera, start: SE3 | None = None, bend: Shape | None = None
+    view: BoardView, camera: Camera, start: SE3 | None = None, bend: Bend | None = None
 ) -> BoardPose:
     """Fit the pose of a board to its corners, from a start or from the better of its candidates."""
     if not start:
@@ -218,7 +205,7 @@ def board_pose(
     by_rotation = by_point @ (-matrix @ cross_matrix(points))
     jacobian = np.concatenate([by_point, by_rotation], 2).reshape(-1, 6)
     by_shape = by_point @ matrix @ by_bend
-    by_lens = np.c_[by_camera, by_shape.reshape(-1, len(bend.terms))]
+    by_lens = np.c_[by_camera, by_shape.reshape(-1, len(BEND))]
     slopes = CornerSlopes(jacobian, by_lens, _by_rows(view.pixels, camera))
     pose = SE3.of(rotation, np.ravel(translation))
     return _fitted(pose, (view.pixels - projected).ravel(), slopes)

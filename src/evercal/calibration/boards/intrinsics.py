@@ -16,7 +16,6 @@ from evercal.calibration.boards.corners import (
     Bend,
     BoardPose,
     BoardView,
-    Shape,
     board_pose,
     lens_vector,
     strays,
@@ -130,7 +129,7 @@ def lens_estimate(
     poses: Sequence[BoardPose],
     sigma_px: float,
     camera: Camera,
-    bend: Shape,
+    bend: Bend,
     prior: LensPrior,
 ) -> ArrayPair:
     """Estimate the change (q,) of the intrinsics and the bend that board poses were fitted with.
@@ -171,7 +170,7 @@ def moved_camera(camera: Camera, change: Array) -> Camera:
 
 
 def fitted_poses(
-    views: Sequence[BoardView], camera: Camera, starts: Sequence[SE3] | SE3, bend: Shape
+    views: Sequence[BoardView], camera: Camera, starts: Sequence[SE3] | SE3, bend: Bend
 ) -> list[BoardPose]:
     """Fit the pose of the board in every view from its start."""
     pairs = zip(views, starts, strict=True)

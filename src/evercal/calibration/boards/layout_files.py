@@ -5,7 +5,7 @@ read in all these ways, and the images decide, see `evercal.calibration.boards.t
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -14,47 +14,41 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.tags import Corners, square
-from evercal.recordings.poses.row_files import name_and_unit
+from evercal.recordings.poses.row_files import is_number, name_and_unit, table_cells
 from evercal.storage.text_files import documents, named_errors, read_text
+from evercal.typing import JsonObject
 
 _ID = re.compile(r"(?:tag|marker|aruco|fiducial)?_?(?:id|index|number)")
 """Names of a tag's number."""
 _NUMBERED = re.compile(r"(?:tag|marker|aruco|id)?[_ -]?(\d+)")
 """Keys that are the number of a tag."""
-_FIELDS = {
-    "size": r"(?:default_)?(?:tag_|marker_)?(?:size|length|side|edge)",
-    "corners": r"|(?:\w+_)?(?:corners?|points)|[a-z]*_?\d_?[xyz]|[xyz]_?\d",
-    "rotation": r"(?:\w+_)?(?:q|quat\w*|orientation|rot\w*|rpy|euler|rvec|r)(?:_?[wxyz0-3])?"
-    r"|(?:\w+_)?(?:roll|pitch|yaw)",
-    "position": r"(?:\w+_)?(?:p|pos|position|translation|tvec|t(?=_?[xyz])|xyz|cent\w+)(?:_?[xyz])?"
-    r"|(?:pose_)?[xyz]",
-    "matrix": r"(?:\w+_)?(?:transform|matrix|pose|t)",
+_MEANINGS = {
+    "beside": "id index number variance var noise covariance num obs",
+    "size": "size length side edge width",
+    "corners": "corner corners point points",
+    "rotation": "rotation quaternion orientation quat rot q qw qx qy qz rvec rx ry rz rpy euler"
+    " roll pitch yaw",
+    "position": "position translation pos p tvec tx ty tz center centre xyz x y z",
+    "pose": "pose transform matrix t",
 }
-"""Names of numbers, by their meaning."""
-_BESIDE = r"(?:\w+_)?(?:variance|var|noise|num_?obs|covariance|r)"
-"""Names of what is no part of a layout."""
+"""Words in the names of numbers, by their meaning; the first meaning counts."""
 _COUNTS = {"size": (1,), "corners": (12,), "position": (3,), "rotation": (3, 4, 9)}
 """Possible numbers of numbers."""
 _METRES = {"mm": 0.001, "cm": 0.01}
 """Metres of units in names."""
 _HEADERS = {
-    13: "id " + " ".join(f"c{k}{axis}" for k in range(4) for axis in "xyz"),
+    13: "id x0 y0 z0 x1 y1 z1 x2 y2 z2 x3 y3 z3",
     9: "id x y z q0 q1 q2 q3 size",
     8: "id x y z q0 q1 q2 q3",
 }
 """Columns of tables without a header."""
-_FIDUCIALS = "id x y z roll pitch yaw variance numobs"
-"""Columns of a map of fiducial_slam; numbers of other tags follow."""
-
 _UNITS = (1.0, 0.001, 1000.0)
 """Units of positions against those of sides."""
+_ANGLES = tuple(product(("xyz", "XYZ", "zyx", "ZYX"), (True, False)))
+"""Orders of angles, and whether they are in degrees."""
 
-Keys: TypeAlias = tuple[str | int, ...]
-"""Keys in lower case and indices that lead to a number of a file."""
-Leaves: TypeAlias = Sequence[tuple[Keys, float]]
-"""All numbers of a file."""
 Tag: TypeAlias = dict[str, list[float]]
-"""Numbers of a tag by their meaning, see `_FIELDS`."""
+"""Numbers of a tag by their meaning, see `_MEANINGS`."""
 
 
 def read_tags(path: Path) -> dict[int, Tag]:
@@ -67,143 +61,136 @@ def read_tags(path: Path) -> dict[int, Tag]:
             data = documents(text, path.suffix == ".json")
             if isinstance(data[0], Mapping) and "camera_from" in data[0]:
                 # A file of board poses.
-                rows = data[0]["board"]["layout"]
-                data = [
-                    dict(zip(_HEADERS[13].split(), row, strict=True)) for row in rows
-                ]
-            leaves = [*_leaves(data, ())]
+                data = _named(data[0]["board"]["layout"])
         else:
-            leaves = [*_leaves(_table(text), ())]
-        return _tags(leaves)
-
-
-def _table(text: str) -> list[dict[str, str]]:
-    lines = re.findall(r"^[^#\n]+", text, re.MULTILINE)
-    rows = [re.split(r"[,;\s]+", line.strip()) for line in lines if line.strip()]
-    header = rows[0] if rows else []
-    if rows and re.fullmatch(r"[\d.]+", header[0]):
-        counts = header[8:]
-        if counts and "." in header[1] and all(cell.isdigit() for cell in counts):
-            rows = [row[:9] for row in rows]
-            header = _FIDUCIALS.split()
-        else:
-            header = _HEADERS.get(len(header), "").split()
-    else:
-        rows = rows[1:]
-    tags = []
-    for row in rows:
-        if len(row) != len(header):
+            lines = [line for line in text.splitlines() if line[:1] != "#"]
+            data = _named(table_cells(lines).tolist())
+        bodies = [*_bodies(data)]
+        if len(bodies) != 1:
             raise ValueError(
-                f"a row has {len(row)} cells, the header {len(header)}; give a header such as"
-                " id,x,y,z,qw,qx,qy,qz,size"
+                f"holds {len(bodies)} things with tags, not one; give for each tag its id and"
+                " corners, or id, x, y, z, a rotation and size"
             )
-        tags.append(dict(zip(header, row, strict=True)))
-    return tags
+        return bodies[0]
 
 
-def _leaves(value: Any, path: Keys) -> Iterator[tuple[Keys, float]]:
-    """Yield the numbers in a value."""
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from _leaves(item, (*path, str(key).lower()))
-    elif isinstance(value, list):
-        for k, item in enumerate(value):
-            yield from _leaves(item, (*path, k))
-    elif re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?", str(value).lower()):
-        yield path, float(value)
-
-
-def _tags(leaves: Leaves) -> dict[int, Tag]:
-    places: dict[Keys, int] = {}
-    for path, value in leaves:
-        if "standalone_tags" in path:
-            continue
-        if _ID.fullmatch(str(path[-1])):
-            places[path[:-1]] = int(value)
-        for k, word in enumerate(path):
-            match = _NUMBERED.fullmatch(word) if isinstance(word, str) else None
-            if match:
-                places[path[: k + 1]] = int(match[1])
-    tags = {number: _tag(number, place, leaves) for place, number in places.items()}
-    if not tags:
+def _named(rows: list[list[object]]) -> list[JsonObject]:
+    """Rows of a table with the names of their columns."""
+    width = len(rows[0]) if rows else 0
+    header = _HEADERS.get(width, "").split()
+    if rows and not is_number(rows[0][0]):
+        header = [str(word) for word in rows[0]]
+        rows = rows[1:]
+    if len(header) != width:
         raise ValueError(
-            "holds no tags; give for each its id and corners, or id, x, y, z, a rotation and size"
+            f"has {width} columns without names; give a header such as"
+            " id,x,y,z,qw,qx,qy,qz,size"
         )
-    if len({place[:-1] for place in places}) > 1 or len(tags) < len(places):
-        raise ValueError("holds several bodies, or a tag twice; leave one of them")
-    return tags
+    return [dict(zip(header, row, strict=True)) for row in rows]
 
 
-def _tag(number: int, place: Keys, leaves: Leaves) -> Tag:
-    named: dict[str, list[float]] = {}
+def _bodies(value: Any) -> Iterator[dict[int, Tag]]:
+    """Yield the tags of each list of tags, by their numbers."""
+    items = value.items() if isinstance(value, Mapping) else []
+    if isinstance(value, list):
+        items = [("", item) for item in value]
+    tags: dict[int, Tag] = {}
+    for key, item in items:
+        number = _number(str(key).lower(), item)
+        if number in tags:
+            raise ValueError(f"holds tag {number} twice")
+        if number is not None:
+            tags[number] = _tag(number, item)
+        elif key != "standalone_tags":
+            yield from _bodies(item)
+    if tags:
+        yield tags
+
+
+def _number(key: str, item: object) -> int | None:
+    """The number of a tag; None for another entry of a file."""
+    match = _NUMBERED.fullmatch(key)
+    if match and isinstance(item, (list, Mapping)):
+        return int(match[1])
+    if isinstance(item, Mapping):
+        for name, value in item.items():
+            if _ID.fullmatch(str(name).lower()):
+                if str(value).isdigit():
+                    return int(value)
+                raise ValueError(f"the number of a tag is whole, got {value!r}")
+    return None
+
+
+def _tag(number: int, item: object) -> Tag:
     tag: Tag = {}
-    for path, value in leaves:
-        words = "_".join(map(str, path[len(place) :]))
-        name, unit = name_and_unit(re.sub(r"(^|_)\d+(_\d+)*$", "", words))
-        if path[: len(place)] == place:
-            own = named.setdefault(name, [])
-            own.append(value * _METRES.get(unit or "", 1.0))
-        elif path[:-1] == place[: len(path) - 1] and _meaning(path[-1]) == "size":
-            tag["size"] = [value]
-    for name in sorted(named, key=_order):
-        own = named[name]
-        meaning = _meaning(name)
-        if meaning == "matrix" and len(own) in (12, 16):
-            matrix = np.reshape(own, (-1, 4))[:3]
-            own = [*matrix[:, 3], *matrix[:, :3].ravel()]
-        if meaning == "matrix":
-            tag |= {"position": own[:3], "rotation": own[3:]}
-        elif meaning and len(own) < 13:
-            kept = tag.get(meaning, []) if meaning != "size" else []
-            tag[meaning] = kept + own
-        elif not _ID.fullmatch(name) and not re.fullmatch(_BESIDE, name):
-            raise ValueError(f"{name!r} of tag {number} is not known; leave it out")
-    for meaning, own in tag.items():
-        if len(own) not in _COUNTS[meaning]:
-            raise ValueError(f"the {meaning} of tag {number} has {len(own)} numbers")
+    for name, value in _leaves(item, "" if isinstance(item, Mapping) else "corners"):
+        plain, unit = name_and_unit(name.strip("_"))
+        words = re.findall("[a-z]+", plain)
+        for meaning, known in _MEANINGS.items():
+            if not {*words}.isdisjoint(known.split()):
+                values = tag.setdefault(meaning, [])
+                values.append(value * _METRES.get(unit or "", 1.0))
+                break
+        else:
+            raise ValueError(f"{plain!r} of tag {number} is not known; leave it out")
+    tag.pop("beside", None)
+    pose = tag.pop("pose", [])
+    if len(pose) in (12, 16):
+        matrix = np.reshape(pose, (-1, 4))[:3]
+        pose = [*matrix[:, 3], *matrix[:, :3].ravel()]
+    if pose:
+        tag |= {"position": pose[:3], "rotation": pose[3:]}
+    if len(tag.get("position", [])) == 12:
+        tag["corners"] = tag.pop("position")
+    for meaning, values in tag.items():
+        if len(values) not in _COUNTS[meaning]:
+            raise ValueError(f"the {meaning} of tag {number} has {len(values)} numbers")
     return tag
 
 
-def _meaning(name: object) -> str:
-    """The meaning of a number by its name; empty if it is not known."""
-    for meaning, names in _FIELDS.items():
-        if re.fullmatch(names, str(name)):
-            return meaning
-    return ""
-
-
-def _order(name: str) -> tuple[str, bool, str]:
-    """Corner by corner, scalar parts first, roll before pitch, else by the alphabet."""
-    digits = re.sub(r"\D", "", name)
-    return digits, not re.search("(?<!a)w$", name), name.replace("roll", "a")
+def _leaves(value: Any, name: str) -> Iterator[tuple[str, float]]:
+    """Yield the numbers in a value, with the keys that lead to them."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _leaves(item, f"{name}_{key}")
+    elif isinstance(value, list):
+        for item in value:
+            yield from _leaves(item, name)
+    elif is_number(value) and np.isfinite(float(value)):
+        yield name, float(value)
 
 
 def layout_readings(tags: dict[int, Tag], side_m: float) -> Iterator[Corners]:
     """Yield what the tags of a file may be, metres; `side_m` is the side of those without one."""
-    if all("corners" in tag for tag in tags.values()):
+    corners = {number: tag.get("corners", []) for number, tag in tags.items()}
+    if all(corners.values()):
         for first, step in product(range(4), (1, -1)):
             order = (first + step * np.arange(4)) % 4
             yield {
-                number: np.reshape(tag["corners"], (4, 3))[order]
-                for number, tag in tags.items()
+                number: np.reshape(own, (4, 3))[order]
+                for number, own in corners.items()
             }
         return
-    for unit, way, axes in product(_UNITS, range(5), Rotation.create_group("O")):
+    turns = {
+        number: _rotations(tag.get("rotation", [])) for number, tag in tags.items()
+    }
+    ways = range(min(map(len, turns.values())))
+    for unit, way, axes in product(_UNITS, ways, Rotation.create_group("O")):
         layout = {}
         for number, tag in tags.items():
-            print_ = axes.apply(square(1.0)) * tag.get("size", side_m)
-            turned = _rotation(tag.get("rotation", []), way).apply(print_)
-            layout[number] = unit * np.array(tag.get("position", [0, 0, 0])) + turned
+            printed = axes.apply(square(1.0)) * tag.get("size", side_m)
+            middle = unit * np.array(tag.get("position", [0, 0, 0]))
+            layout[number] = middle + turns[number][way].apply(printed)
         yield layout
 
 
-def _rotation(numbers: list[float], way: int) -> Rotation:
+def _rotations(numbers: list[float]) -> list[Rotation]:
     """What a rotation may be."""
+    if not numbers:
+        return [Rotation.identity()]
     if len(numbers) == 9:
-        return Rotation.from_matrix(np.reshape(numbers, (3, 3)))
+        return [Rotation.from_matrix(np.reshape(numbers, (3, 3)))]
     if len(numbers) == 4:
-        return Rotation.from_quat(numbers, scalar_first=way % 2 == 0)
-    if len(numbers) == 3 and way:
-        order = "xyz" if way < 3 else "XYZ"
-        return Rotation.from_euler(order, numbers, degrees=way % 2 == 1)
-    return Rotation.from_rotvec(numbers or [0, 0, 0])
+        return [Rotation.from_quat(numbers, scalar_first=way) for way in (True, False)]
+    angles = [Rotation.from_euler(way, numbers, degrees=deg) for way, deg in _ANGLES]
+    return [Rotation.from_rotvec(numbers), *angles]

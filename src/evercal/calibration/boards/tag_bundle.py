@@ -4,66 +4,28 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from evercal.calibration.boards.corners import BoardPose, board_pose, lens_vector
-from evercal.calibration.boards.intrinsics import (
-    LensPrior,
-    lens_estimate,
-    moved_camera,
-)
+from evercal.calibration.boards.corners import board_pose, lens_vector
+from evercal.calibration.boards.intrinsics import LensPrior, moved_camera
 from evercal.calibration.boards.marker_layout import Markers
-from evercal.calibration.boards.row_shift import CornerNoise
 from evercal.calibration.boards.tags import Corners, view_of
-from evercal.geometry import SE3, Camera, cross_matrix, norms
+from evercal.geometry import SE3, Camera
 from evercal.typing import Array
 
-_MAX_STEP = 0.2
-"""Maximum relative change of focal lengths and sides in a round."""
-_STRAY = 5.0
-"""Residual of a tag in an image, usual ones, above which it is left out."""
-_CONVERGED = 1e-3
-"""Squared Mahalanobis length of a change that ends bundle adjustment, a term."""
-_FIXED = 1e-9
-"""Standard deviation of what bundle adjustment keeps."""
-_MAX_ROUNDS = 60
-"""Maximum number of rounds of bundle adjustment."""
+_SIGMA_PX = 0.1
+"""Usual standard deviation of a corner coordinate."""
+_OUTLIER = 5.0
+"""Residual from which corners count less, standard deviations."""
+_BEHIND_PX = 1e4
+"""Residual of corners that the camera cannot see."""
 _TERMS = 7
-"""Unknowns of a tag: position, rotation, relative size."""
-
-
-class LooseTags(NamedTuple):
-    """Tags that move by themselves, as a departure of a board from its drawing."""
-
-    corners: Array
-    """(t, 4, 3) metres."""
-
-    @property
-    def terms(self) -> Array:
-        """(7 t,) zeros: shifts, rotations about the middle, relative sizes."""
-        return np.zeros(_TERMS * len(self.corners))
-
-    def slopes(self, points: Array) -> Array:
-        """Return the (k, 3, 7 t) derivative of corners (k, 3) by the terms."""
-        tag = KDTree(self.corners.reshape(-1, 3)).query(points)[1] // 4
-        arms = points - self.corners.mean(1)[tag]
-        slopes = np.zeros((len(points), 3, len(self.corners), _TERMS))
-        row = np.arange(len(points))
-        slopes[row, :, tag, :3] = np.eye(3)
-        slopes[row, :, tag, 3:6] = -cross_matrix(arms)
-        slopes[row, :, tag, 6] = arms
-        return slopes.reshape(len(points), 3, -1)
-
-    def moved(self, change: Array) -> "LooseTags":
-        """The tags after a (7 t,) change."""
-        corners = []
-        for own, terms in zip(self.corners, change.reshape(-1, _TERMS), strict=True):
-            middle = own.mean(0)
-            turn = Rotation.from_rotvec(terms[3:6])
-            arms = turn.apply(own - middle) * np.exp(terms[6])
-            corners.append(middle + terms[:3] + arms)
-        return LooseTags(np.array(corners))
+"""Unknowns of a tag: shift, rotation about its middle, relative size."""
+_MOST_IMAGES = 30
+"""Number of images that are adjusted."""
+_MEDIAN = 0.6745
+"""Median of the absolute value of a standard normal variable."""
 
 
 class Bundle(NamedTuple):
@@ -71,7 +33,7 @@ class Bundle(NamedTuple):
 
     corners: Corners
     camera: Camera
-    sigma_px: float
+    sigma_px: float = 0.0
     """Standard deviation of a corner coordinate."""
 
 
@@ -79,66 +41,58 @@ def adjusted(
     found: Sequence[Markers], start: Bundle, kept: set[int], stated: bool
 ) -> Bundle:
     """Adjust camera poses, tags that are not `kept`, and intrinsics that are not stated."""
-    numbers = sorted(start.corners)
-    loose = LooseTags(np.array([start.corners[number] for number in numbers]))
     camera = start.camera
-    prior = _prior(camera, stated, [number in kept for number in numbers])
+    numbers = sorted(start.corners)
+    first = np.array([start.corners[number] for number in numbers])
+    poses = []
+    seen = []
+    for markers in found[:: -(-len(found) // _MOST_IMAGES)]:
+        view = view_of(markers, start.corners)
+        if view:
+            pixels = dict(zip(markers.ids.tolist(), markers.corners, strict=True))
+            for k, number in enumerate(numbers):
+                if number in pixels:
+                    seen.append((len(poses), k, pixels[number]))
+            poses.append(board_pose(view, camera).camera_from_board)
+    image, tag, pixels = map(np.array, zip(*seen, strict=True))
+    start_poses = SE3.stack(poses)
     lens = len(lens_vector(camera))
-    fits: list[BoardPose] = []
-    shown = [own.without({*own.ids.tolist()} - {*numbers}) for own in found]
-    starts: dict[int, SE3] = {}
-    corners = start.corners
-    fits: list[BoardPose] = []
-    for _ in range(_MAX_ROUNDS):
-        poses: dict[int, BoardPose] = {}
-        for k, own in enumerate(shown):
-            view = view_of(own, corners)
-            if view:
-                poses[k] = board_pose(
-                    view,
-                    camera,
-                    starts.get(k),
-                    loose,
-                )
-        starts = {k: pose.camera_from_board for k, pose in poses.items()}
-        fits = list(poses.values())
-        sigma_px = CornerNoise.plain(fits).sigma_px
-        change, known = lens_estimate(fits, sigma_px, camera, loose, prior)
-        steps = np.r_[change[:2] / camera.fx, change[lens:].reshape(-1, _TERMS)[:, 6]]
-        change = change / max(1.0, np.abs(steps).max() / _MAX_STEP)
-        loose = loose.moved(change[lens:])
-        camera = moved_camera(camera, change[:lens])
-        corners = dict(
-            zip(
-                numbers,
-                loose.corners,
-                strict=True,
-            )
+    prior = LensPrior.usual(camera)
+    known = np.linalg.cholesky(prior.information[:lens, :lens]).T
+    is_kept = np.repeat([number in kept for number in numbers], _TERMS)
+    free = ~np.r_[np.full(lens, stated), is_kept, np.zeros(6 * len(poses), bool)]
+
+    def moved(values: Array) -> tuple[Camera, Array, SE3]:
+        change = np.zeros(len(free))
+        change[free] = values
+        of_lens, of_tags, of_poses = np.split(change, [lens, lens + len(is_kept)])
+        return (
+            moved_camera(camera, of_lens),
+            _moved_tags(first, of_tags.reshape(-1, _TERMS)),
+            start_poses @ SE3.exp(of_poses.reshape(-1, 6)),
         )
-        if change @ known @ change < _CONVERGED * len(change):
-            rms = {k: norms(fit.residual_px.reshape(-1, 8)) for k, fit in poses.items()}
-            most = _STRAY * float(np.median(np.concatenate([*rms.values()])))
-            strays = {k: shown[k].ids[own > most].tolist() for k, own in rms.items()}
-            if not any(strays.values()):
-                break
-            shown = [own.without(strays.get(k, ())) for k, own in enumerate(shown)]
-    return Bundle(corners, camera, CornerNoise.plain(fits).sigma_px)
+
+    def residuals(values: Array) -> Array:
+        own, corners, poses = moved(values)
+        projected = own.project(poses[image[:, None]].apply(corners[tag]))
+        errors = np.nan_to_num(projected - pixels, nan=_BEHIND_PX) / _SIGMA_PX
+        return np.r_[errors.ravel(), known @ (lens_vector(own) - prior.mean[:lens])]
+
+    start_values = np.zeros(free.sum())
+    fit = least_squares(
+        residuals, start_values, loss="soft_l1", f_scale=_OUTLIER, x_scale="jac"
+    )
+    own, corners, _ = moved(fit.x)
+    errors = fit.fun[: pixels.size]
+    freedom = max(1, pixels.size - int(free.sum()))
+    sigma = _SIGMA_PX * np.median(np.abs(errors)) / _MEDIAN
+    sigma_px = float(sigma * np.sqrt(pixels.size / freedom))
+    return Bundle(dict(zip(numbers, corners, strict=True)), own, sigma_px)
 
 
-def _prior(
-    camera: Camera,
-    stated: bool,
-    kept: Sequence[bool],
-) -> LensPrior:
-    """What is known of intrinsics and tags before."""
-    usual = LensPrior.usual(camera)
-    vector = lens_vector(camera)
-    lens = len(vector)
-    mean = np.r_[usual.mean[:lens], np.zeros(_TERMS * len(kept))]
-    fixed = np.r_[np.zeros(lens), np.repeat(kept, _TERMS) / _FIXED**2]
-    information = np.diag(fixed)
-    information[:lens, :lens] = usual.information[:lens, :lens]
-    if stated:
-        mean[:lens] = vector
-        information[:lens, :lens] = np.eye(lens) / _FIXED**2
-    return LensPrior(mean, information)
+def _moved_tags(corners: Array, change: Array) -> Array:
+    """Corners (t, 4, 3) of tags after a (t, 7) change."""
+    middle = corners.mean(1, keepdims=True)
+    turn = Rotation.from_rotvec(change[:, 3:6]).as_matrix()
+    arms = (corners - middle) @ turn.transpose(0, 2, 1)
+    return middle + change[:, None, :3] + arms * np.exp(change[:, None, 6:])

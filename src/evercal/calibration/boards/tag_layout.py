@@ -17,16 +17,14 @@ from evercal.calibration.boards.corners import (
     board_pose,
     board_pose_candidates,
 )
-from evercal.calibration.boards.intrinsics import (
-    rough_camera,
-)
+from evercal.calibration.boards.intrinsics import rough_camera
 from evercal.calibration.boards.layout_files import layout_readings, read_tags
 from evercal.calibration.boards.marker_layout import Markers
 from evercal.calibration.boards.tag_bundle import Bundle, adjusted
 from evercal.calibration.boards.tags import Corners, square, view_of, with_corners
 from evercal.classes import frozen
 from evercal.errors import InputError
-from evercal.geometry import Camera, norms
+from evercal.geometry import SE3, Camera, norms
 from evercal.storage.text_files import named_errors
 from evercal.typing import Array, ArrayPair, Size, Strings
 
@@ -96,20 +94,9 @@ class Arrangement:
         corners: Corners = {}
         with named_errors(path, "layout of tags"):
             for reading in layout_readings(tags, self.board.size_m):
-                own = float(
-                    np.median(
-                        [
-                            _misfit(
-                                own,
-                                reading,
-                                camera,
-                            )
-                            for own in images
-                        ]
-                    )
-                )
+                own = np.median([_misfit(image, reading, camera) for image in images])
                 if own < misfit - 1e-6:
-                    misfit = own
+                    misfit = float(own)
                     corners = reading
                 if misfit < _FITS:
                     break
@@ -121,47 +108,24 @@ class Arrangement:
         first = self.board.tag if self.board.tag in corners else min(corners)
         scale = self.board.size_m / _side(corners[first])
         corners = {number: scale * own for number, own in corners.items()}
-        notes: Strings = ()
+        notes = []
         if min(abs(np.log(scale / unit)) for unit in _UNITS) > _SAME_SIZE:
-            notes = (
+            notes.append(
                 f"warning: {path.name} was scaled by {scale:.5g}, so that tag {first} measures"
-                f" {1000 * self.board.size_m:g} mm",
+                f" {1000 * self.board.size_m:g} mm"
             )
-        return corners, (
-            *notes,
-            *self._contradictions(path.name, corners, shown, camera),
-        )
-
-    def _contradictions(
-        self, name: str, corners: Corners, shown: Sequence[Markers], camera: Camera
-    ) -> Strings:
-        """What images say against a layout."""
-        start = Bundle(
-            corners,
-            camera,
-            0.0,
-        )
-        rigid = adjusted(
-            shown,
-            start,
-            {*corners},
-            bool(self.camera),
-        )
-        loose = adjusted(
-            shown,
-            rigid,
-            {min(corners)},
-            bool(self.camera),
-        )
-        if rigid.sigma_px < _WORSE * loose.sigma_px:
-            return ()
-        pairs = [(own, loose.corners[number]) for number, own in corners.items()]
-        moved_mm = 1000 * max(norms(other - own).max() for own, other in pairs)
-        return (
-            f"warning: the images contradict {name}: corners fit to {rigid.sigma_px:.2f} px"
-            f" with it and to {loose.sigma_px:.2f} px with tags moved by up to {moved_mm:.1f} mm;"
-            " measure again, or give `layout` estimate",
-        )
+        stated = bool(self.camera)
+        rigid = adjusted(shown, Bundle(corners, camera), {*corners}, stated)
+        loose = adjusted(shown, rigid, {first}, stated)
+        if rigid.sigma_px > _WORSE * loose.sigma_px:
+            apart = [
+                norms(loose.corners[number] - corners[number]) for number in corners
+            ]
+            notes.append(
+                f"warning: in the images, tags lie up to {1000 * np.max(apart):.1f} mm elsewhere"
+                f" than in {path.name}; measure again, or give `layout` estimate"
+            )
+        return corners, tuple(notes)
 
     def _estimated(
         self, found: Sequence[Markers], counts: Counter[int], camera: Camera
@@ -169,29 +133,15 @@ class Arrangement:
         kept = self.board.tag
         if kept is None:
             kept = min(counts, key=lambda number: (-counts[number], number))
-        corners = _placed(
-            found,
-            kept,
-            self.board.size_m,
-            camera,
-        )
+        corners = _placed(found, kept, self.board.size_m, camera)
         if len(corners) < 2:
             raise InputError(
                 f"no image shows tag {kept} beside another one; `layout` estimate takes images"
                 " that show two tags or more"
             )
         alone = sorted({*counts} - {*corners})
-        start = Bundle(
-            corners,
-            camera,
-            0.0,
-        )
-        corners = adjusted(
-            found,
-            start,
-            {kept},
-            bool(self.camera),
-        ).corners
+        start = Bundle(corners, camera)
+        corners = adjusted(found, start, {kept}, bool(self.camera)).corners
         sides = [f"{number} {1000 * _side(own):.2f}" for number, own in corners.items()]
         notes = [f"sides by the images, mm: {', '.join(sides)}"]
         if alone:
@@ -204,17 +154,17 @@ def _side(corners: Array) -> float:
     return float(norms(np.diff(corners, axis=0)).mean())
 
 
-def _misfit(
-    markers: Markers,
-    corners: Corners,
-    camera: Camera,
-) -> float:
+def _misfit(markers: Markers, corners: Corners, camera: Camera) -> float:
     """Residual of tags in an image, parts of a side."""
     view = view_of(markers, corners)
-    if view:
-        with suppress(ValueError):
-            return board_pose(view, camera).rms_px / _side(view.pixels[:4])
-    return np.inf
+    if not view:
+        return np.inf
+    misfits = [np.inf]
+    with suppress(ValueError):
+        for pose in board_pose_candidates(view, camera):
+            errors = camera.project(pose.apply(view.points_m)) - view.pixels
+            misfits.append(float(np.nan_to_num(norms(errors), nan=np.inf).mean()))
+    return min(misfits) / _side(view.pixels[:4])
 
 
 def _placed(
@@ -233,16 +183,13 @@ def _placed(
             if not view:
                 continue
             base = board_pose(view, camera).camera_from_board.inverse()
-            for number, pixels in zip(
-                markers.ids.tolist(), markers.corners, strict=True
-            ):
+            eye = base.translation_m
+            others = markers.without(placed)
+            for number, pixels in zip(others.ids.tolist(), others.corners, strict=True):
                 poses = board_pose_candidates(BoardView(points, pixels), camera)
-                arms = [
-                    (base @ pose).apply(points) - base.translation_m for pose in poses
-                ]
-                if arms and number not in placed:
-                    pair = (base.translation_m, np.array(arms))
-                    beside.setdefault(number, []).append(pair)
+                if poses:
+                    corners = (base @ SE3.stack(poses))[:, None].apply(points)
+                    beside.setdefault(number, []).append((eye, corners - eye))
         if not beside:
             return placed
         number = max(beside, key=lambda number: len(beside[number]))
@@ -251,10 +198,7 @@ def _placed(
         placed[number] = min(sizes, key=lambda pair: pair[0])[1]
 
 
-def _recurring(
-    images: Sequence[ArrayPair],
-    scale: float,
-) -> tuple[float, Array]:
+def _recurring(images: Sequence[ArrayPair], scale: float) -> tuple[float, Array]:
     """The corners (4, 3) of a tag that are nearest to those in each image, and how near."""
     corners = [eye + scale * arms for eye, arms in images]
     candidates = np.concatenate(corners)
