@@ -121,20 +121,11 @@ def solve_pose_pairs(
         pairs, corners, lens, start, scale = refined
     problem = _Problem(mount, scale, scale_known, corners, of_board)
     equation, fit, lens = problem.fitted(pairs, rows, start.at, lens)
-    slip = find_slip(equation, fit, rows)
-    kinds = shared_errors(pairs.base_from_gripper, errors)
-    shared = {name: kind.of_rows(rows) for name, kind in kinds.items()}
-    sharing = replace(equation, shared=shared)
-    evidence = evidence_of_shared(sharing[fit.inliers].system(fit.at))
-    # Errors that poses share look like a step, and a step like errors that poses share.
-    if slip and slip.evidence < evidence:
-        slip = None
+    plain = equation, fit
+    equation, fit, slip = _with_shared(pairs, rows, errors, equation, fit)
     focused = []
     if of_board and not slip:
-        focused = focus_warning(equation, fit, rows, pairs.names)
-    if not slip and evidence > WANTED:
-        equation = sharing
-        fit = robust_fit(equation, agreement(equation, fit.at))
+        focused = focus_warning(*plain, rows, pairs.names)
     warnings: list[str] = []
     if scale_known:
         equation, fit, warnings = with_tested_size(equation, fit, corners, of_board)
@@ -161,6 +152,27 @@ def solve_pose_pairs(
         corners=corners,
         lens=lens,
     )
+
+
+def _with_shared(
+    pairs: PosePairs,
+    rows: IntArray,
+    errors: ArmErrors,
+    equation: PoseEquation,
+    fit: HandEyeFit,
+) -> tuple[PoseEquation, HandEyeFit, Slip | None]:
+    """Find a step, or take in errors that poses share: one looks like the other."""
+    slip = find_slip(equation, fit, rows)
+    kinds = shared_errors(pairs.base_from_gripper, errors)
+    shared = {name: kind.of_rows(rows) for name, kind in kinds.items()}
+    sharing = replace(equation, shared=shared)
+    evidence = evidence_of_shared(sharing[fit.inliers].system(fit.at))
+    if slip and slip.evidence >= evidence:
+        return equation, fit, slip
+    if evidence > WANTED:
+        fit = robust_fit(sharing, agreement(sharing, fit.at))
+        equation = sharing
+    return equation, fit, None
 
 
 def _require_agreement(
