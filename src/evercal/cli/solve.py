@@ -93,7 +93,7 @@ class Solve(args.Verb):
 
             return self._write_rig(rig_of(cameras))
         if not cameras and not self.robot_poses:
-            from evercal.calibration.fixed.solved import solve_rig
+            from evercal.calibration.fixed.rig import solve_rig
 
             return self._write_rig(solve_rig(self._sightings()))
         source = {"command": "solve"}
@@ -117,12 +117,13 @@ class Solve(args.Verb):
         if known.points:
             return {"": self._by_points(known.points)}
         if known.board_at:
-            from evercal.calibration.fixed.solved import solve_place
+            from evercal.calibration.fixed.still import solve_place
             from evercal.calibration.transform_file import read_place
             from evercal.geometry import UncertainPose
 
             place = UncertainPose(*read_place(known.board_at, known.board_accuracy))
-            return solve_place(self._sightings(), place)
+            seen = self._sightings()
+            return {camera.name: solve_place(camera, place) for camera in seen}
         if not self.camera_poses:
             raise InputError("give --camera-poses, or --points of a fixed camera")
         if not self.robot_poses:

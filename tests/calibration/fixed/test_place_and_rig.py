@@ -12,8 +12,9 @@ from evercal.calibration.boards.board import Board
 from evercal.calibration.boards.board_poses import board_poses
 from evercal.calibration.boards.corners import BoardView
 from evercal.calibration.evidence import plus
+from evercal.calibration.fixed.rig import solve_rig
 from evercal.calibration.fixed.sightings import read_sightings
-from evercal.calibration.fixed.solved import solve_place, solve_rig
+from evercal.calibration.fixed.still import solve_place
 from evercal.calibration.transform_file import read_place
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose
@@ -61,19 +62,19 @@ def test_a_board_at_a_known_place_calibrates_with_an_honest_sigma(
     tmp_path: Path, corners: Array, images: int
 ) -> None:
     inside = 0
-    for seed in range(5):
+    for seed in range(3):
         error = np.random.default_rng(seed).normal(size=6) * np.sqrt(np.diag(SIGMA))
         camera_from_board = seen_at(seed)
         file = board_file(
             tmp_path / "left.json", corners, [camera_from_board] * images, 0.15
         )
         place = UncertainPose(PLACE, SIGMA)
-        found = solve_place(read_sightings([file]), place)["left"]
+        found = solve_place(read_sightings([file])[0], place)
         truth = plus(PLACE, error) @ camera_from_board.inverse()
         inside += found.uncertain_pose.squared_mahalanobis(truth) < 12.6
         assert found.sigma_mm < 30
-        assert "turned by 90 or 180 deg" in (found.checks.left_open or ())[0]
-    assert inside >= 5
+        assert "turned by 90 or 180 deg" in " ".join(found.checks.left_open or ())
+    assert inside == 3
 
 
 def test_the_accuracy_of_the_place_is_in_the_sigma(tmp_path: Path) -> None:
@@ -81,7 +82,7 @@ def test_the_accuracy_of_the_place_is_in_the_sigma(tmp_path: Path) -> None:
     sigmas = []
     for accuracy in ("0.1,0.01", "20,0.01"):
         place = UncertainPose(*read_place("0.5,0.1,0.02,1,0,0,0", accuracy))
-        sigmas.append(solve_place(read_sightings([file]), place)["left"].sigma_mm)
+        sigmas.append(solve_place(read_sightings([file])[0], place).sigma_mm)
     assert sigmas[1] ** 2 - sigmas[0] ** 2 == pytest.approx(400, rel=0.5)
 
 
@@ -92,7 +93,7 @@ def test_the_accuracy_of_the_place_is_in_the_sigma(tmp_path: Path) -> None:
         (0.3 * TAG, [seen_at(2, 0.3, 1.5)], 9, "fit two poses"),
         (GRID, [seen_at(1)], 8, "looks the same after a turn"),
         (GRID, [seen_at(1)], 6, "looks the same after a turn"),
-        (GRID, [seen_at(1), seen_at(2), seen_at(3)], 9, "did cameras stand still"),
+        (GRID, [seen_at(1), seen_at(2), seen_at(3)], 9, "stand still"),
     ],
 )
 def test_boards_that_leave_the_camera_open_are_refused(
@@ -100,7 +101,7 @@ def test_boards_that_leave_the_camera_open_are_refused(
 ) -> None:
     file = board_file(tmp_path / "left.json", corners, poses, 0.3, columns)
     with pytest.raises(InputError, match=message):
-        solve_place(read_sightings([file]), UncertainPose(PLACE, SIGMA))
+        solve_place(read_sightings([file])[0], UncertainPose(PLACE, SIGMA))
 
 
 @pytest.mark.parametrize(
@@ -162,7 +163,7 @@ def test_cameras_are_calibrated_beside_each_other(tmp_path: Path, names: str) ->
     assert [pair.second for pair in rig.relative] == ["right", "front"]
     for pair in rig.relative:
         truth = CAMERAS[pair.second]
-        assert pair.first_from_second.squared_mahalanobis(truth) < 16.8
+        assert pair.first_from_second.squared_mahalanobis(truth) < 22.5
         assert pair.first_from_second.sigma_mm < 5
     assert rig.cameras["right"].parent_frame == "left"
     assert rig.relative[0].moments == (5 if names else 12)
@@ -192,7 +193,7 @@ def test_a_wrong_moment_is_named(tmp_path: Path, outlier: int) -> None:
 def test_cameras_in_parts_are_named(tmp_path: Path) -> None:
     rows = {"left": range(8), "right": range(4, 12), "front": range(20, 26)}
     files = tables(tmp_path, rows)
-    message = r"2 parts.*left \+ right \(8 images.*front \(6 images, first 020"
+    message = r"front \(6 images, first 020.*left \+ right saw .* 0 moments"
     with pytest.raises(InputError, match=message):
         solve_rig(read_sightings(files))
     with pytest.raises(InputError, match="one camera alone"):
@@ -203,7 +204,8 @@ def test_cameras_in_parts_are_named(tmp_path: Path) -> None:
 
 def inverse(lines: list[list[str]]) -> None:
     for row in lines:
-        pose = SE3([*map(float, row[4:])], [*map(float, row[1:4])]).inverse()
+        values = np.array([*map(float, row[1:])])
+        pose = SE3(values[3:], values[:3]).inverse()
         row[1:] = [*map(str, [*pose.translation_m, *pose.rotation_wxyz])]
 
 
@@ -223,7 +225,7 @@ def larger(lines: list[list[str]]) -> None:
     [
         (inverse, "`invert` camera"),
         (reversed_rows, "one name"),
-        (larger, "1.5 times as large as in left"),
+        (larger, "1.5 times as far"),
     ],
 )
 def test_cameras_that_contradict_each_other_are_refused(
@@ -237,3 +239,16 @@ def test_cameras_that_contradict_each_other_are_refused(
     files[1].write_text("\n".join([head, *map(",".join, lines)]))
     with pytest.raises(InputError, match=message):
         solve_rig(read_sightings(files))
+
+
+def test_a_rig_of_few_moments_is_honest_or_refused(tmp_path: Path) -> None:
+    rows = {"left": range(2), "right": range(2)}
+    with pytest.raises(InputError, match="at 2 moments; record 3 or more"):
+        solve_rig(read_sightings(tables(tmp_path, rows)))
+    inside = 0
+    for first in range(0, 24, 3):
+        rows = {"left": range(first, first + 3), "right": range(first, first + 3)}
+        rig = solve_rig(read_sightings(tables(tmp_path, rows)))
+        pose = rig.relative[0].first_from_second
+        inside += pose.squared_mahalanobis(CAMERAS["right"]) < 12.6
+    assert inside >= 7

@@ -14,7 +14,7 @@ from evercal.typing import Array
 _USUAL_PX = 0.3
 """Usual noise of a corner, which counts as much as `_FREEDOM` residuals."""
 _FREEDOM = 4.0
-_ROUNDS = 6
+_ROUNDS = 3
 """Changes of the intrinsics."""
 _NO_PRINT = 1e18
 """Information on the shape of points that are no print."""

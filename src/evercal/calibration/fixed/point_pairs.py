@@ -9,7 +9,7 @@ from scipy.stats import chi2, f
 
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.checks import Checks
-from evercal.calibration.fixed.solved import image_uses, judged
+from evercal.calibration.fixed.sightings import image_uses, judged
 from evercal.calibration.from_map.align import umeyama
 from evercal.calibration.unseen.touched import DEPTH_M, DEPTH_SHARE, TOUCH_M
 from evercal.errors import InputError
@@ -29,7 +29,6 @@ _LEAST_USED = 0.6
 """Share of points that agree."""
 _MOST_APART = 0.05
 """Largest standard deviation, parts of the extent of the points."""
-_ROUNDS = 5
 _FREEDOM = 2.0
 """Weight of the usual noise of depths, degrees of freedom."""
 _SCALE_SIGMAS = 4.0
@@ -52,44 +51,45 @@ def solve_points(
     seen: Array,
 ) -> Calibration:
     """Calibrate a fixed camera by points (n, 3) in the base and in the camera frame, metres."""
-    extent = _extent(seen, robot)
+    if len(seen) < _LEAST:
+        raise InputError(
+            f"{counted(len(seen), 'point')} by robot and camera; give {_LEAST} or more, better 20,"
+            " not all on one line"
+        )
+    umeyama(seen, robot, True)  # refuses points on one line
+    extent = float(np.median(pdist(seen)))
+    ratio = float(np.median(pdist(robot))) / extent
+    if abs(np.log(ratio)) > _OTHER_UNIT:
+        raise InputError(
+            f"the robot's points lie {ratio:.4g} times as far apart as the camera's: give both in"
+            " metres, and each point in the same row of both"
+        )
     misses = _least_median(seen, robot)
     sigma = float(np.median(misses)) / chi2.median(3) ** 0.5
-    rounds = 0
-    while True:
-        used = misses < _SIGMAS * max(sigma, TOUCH_M)
-        if used.mean() < _LEAST_USED or sigma > _MOST_APART * extent:
-            mirrored = _least_median(seen * [1, 1, -1], robot)
-            same = np.median(mirrored) < _MOST_APART * extent
-            raise InputError(
-                f"the points of robot and camera agree only to {1000 * sigma:.0f} mm:"
-                f" {_MIRRORED if same else _UNMATCHED}"
-            )
-        about = seen[used] - seen[used].mean(0)
-        free = np.log(umeyama(seen[used], robot[used], False).scale)
-        told = (about**2).sum() / sigma**2
-        growth = float(free * told / (told + DEPTH_SHARE**-2))
-        scale = float(np.exp(growth))
-        pose = umeyama(scale * seen[used], robot[used], True).base_from_map
-        misses = norms(pose.apply(scale * seen) - robot)
-        freedom = _FREEDOM + 3 * int(used.sum()) - 6
-        squared = float((misses[used] ** 2).sum())
-        usual = _FREEDOM * np.square([TOUCH_M, DEPTH_M]).sum()
-        sigma = float(np.sqrt((usual + squared) / freedom))
-        rounds += 1
-        if rounds == _ROUNDS:
-            break
-    covariance = _covariance(pose, scale * seen[used], robot[used], sigma)
-    covariance *= 6 * f.isf(0.05, 6, freedom) / chi2.isf(0.05, 6)
-    warnings = []
+    used = misses < _SIGMAS * max(sigma, TOUCH_M)
+    if used.mean() < _LEAST_USED or sigma > _MOST_APART * extent:
+        mirrored = np.median(_least_median(seen * [1, 1, -1], robot))
+        reason = _MIRRORED if mirrored < _MOST_APART * extent else _UNMATCHED
+        raise InputError(
+            f"the points of robot and camera agree only to {1000 * sigma:.0f} mm: {reason}"
+        )
+    shape = umeyama(seen[used], robot[used], False)
+    about = seen[used] - seen[used].mean(0)
+    rest = norms(shape.points(seen[used]) - robot[used])
+    told = (about**2).sum() / (TOUCH_M**2 + (rest**2).mean() / 3)
+    scale = shape.scale ** float(told / (told + DEPTH_SHARE**-2))
+    pose = umeyama(scale * seen[used], robot[used], True).base_from_map
+    misses = norms(pose.apply(scale * seen) - robot)
+    covariance = _covariance(pose, scale * seen[used], robot[used])
     spread = float(np.sqrt(covariance[6, 6]))
-    if abs(growth) > max(_SCALE_SIGMAS * spread, 0.01):
+    warnings = []
+    if abs(scale - 1) > max(_SCALE_SIGMAS * spread, 0.01):
         warnings.append(
             f"the camera's lengths are {100 / scale - 100:+.1f} % longer than the robot's: check"
             " its depth scale; the calibration allows for it"
         )
     checks = Checks(
-        residual_mm=1000 * float(np.sqrt(squared / used.sum())),
+        residual_mm=1000 * float(np.sqrt((misses[used] ** 2).mean())),
         residual_deg=0.0,
         target_m=float(np.median(norms(seen))),
         scale=scale,
@@ -105,50 +105,34 @@ def solve_points(
     )
 
 
-def _extent(
-    seen: Array,
-    robot: Array,
-) -> float:
-    """Usual distance of two points; refuses few, on one line, or of two units."""
-    if len(seen) < _LEAST:
-        raise InputError(
-            f"{counted(len(seen), 'point')} by robot and camera; give {_LEAST} or more, better 20,"
-            " not all on one line"
-        )
-    umeyama(seen, robot, True)  # refuses points on one line
-    extent = float(np.median(pdist(seen)))
-    ratio = float(np.median(pdist(robot))) / extent
-    if abs(np.log(ratio)) > _OTHER_UNIT:
-        raise InputError(
-            f"the robot's points lie {ratio:.4g} times as far apart as the camera's: give both in"
-            " metres, and each point in the same row of both"
-        )
-    return extent
-
-
 def _covariance(
     pose: SE3,
     seen: Array,
     robot: Array,
-    sigma: float,
 ) -> Array:
     """(7, 7) of the pose and of the logarithm of the scale; the noise along the ray is its own."""
-    rotation = pose.rotation_matrix()
-    slope = np.zeros((len(seen), 3, 7))
-    slope[:, :, :3] = np.eye(3)
-    slope[:, :, 3:6] = -rotation @ cross_matrix(seen)
-    slope[:, :, 6] = seen @ rotation.T
-    ray = unit_vectors(seen @ rotation.T)
+    count = len(seen)
     misses = pose.apply(seen) - robot
-    along = ((misses * ray).sum(1) ** 2).sum() / (misses**2).sum()
-    by_ray = np.einsum("na,nab->nb", ray, slope)
+    usual = np.square([DEPTH_M, TOUCH_M])
+    ray = unit_vectors(pose.rotation.apply(seen))
+    along = ((misses * ray).sum(1) ** 2).sum()
+    squares = np.array([along, ((misses**2).sum() - along) / 2])
+    freedom = _FREEDOM + count - 7 / 3
+    variance = (_FREEDOM * usual + squares) / freedom
+    slope = np.zeros((count, 3, 7))
+    slope[:, :, :3] = np.eye(3)
+    slope[:, :, 3:6] = -pose.rotation_matrix() @ cross_matrix(seen)
+    slope[:, :, 6] = pose.rotation.apply(seen)
+    noise = np.eye(3) * variance[1] + (variance[0] - variance[1]) * (
+        ray[:, :, None] * ray[:, None]
+    )
     rows = slope.reshape(-1, 7)
     normal = rows.T @ rows
-    normal[6, 6] += (sigma / DEPTH_SHARE) ** 2
-    across = (1 - along) / 2
-    scatter = 3 * (across * normal + (along - across) * by_ray.T @ by_ray)
-    inverse = np.linalg.inv(normal)
-    covariance = sigma**2 * inverse @ scatter @ inverse
+    normal[6, 6] += variance.mean() / DEPTH_SHARE**2
+    gain = np.linalg.inv(normal)
+    scatter = (slope.transpose(0, 2, 1) @ noise @ slope).sum(0)
+    covariance = gain @ scatter @ gain
+    covariance *= 6 * f.isf(0.05, 6, 2 * freedom) / chi2.isf(0.05, 6)
     return (covariance + covariance.T) / 2
 
 

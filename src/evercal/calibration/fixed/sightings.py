@@ -1,26 +1,26 @@
 """What fixed cameras saw of one board, moment by moment."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
+from evercal.calibration.calibration import Calibration, ImageUse
 from evercal.calibration.fixed.corner_fit import CornerFit, corner_fit
 from evercal.calibration.pose_pairs.checks import SIZE_SIGMA
 from evercal.calibration.pose_pairs.pair_files import PoseRows, read_camera_poses
+from evercal.calibration.verdict import verdict
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
-from evercal.geometry import SE3, unit_vectors
-from evercal.recordings.poses.pairing import counted
+from evercal.geometry import SE3, norms, unit_vectors
 from evercal.recordings.poses.row_files import last_number, without_ending
-from evercal.typing import Array, Strings
+from evercal.typing import Array, BoolArray, Strings
 
-_APART_S = 0.02
-"""Times of different cameras that differ by less are one moment."""
 _ACROSS = 0.002
 """Usual error of the position of a board across the ray, parts of its distance."""
-_ALONG = 0.01
+_ALONG = 0.005
 """The same along the ray."""
 _TURNED = 0.01
 """Usual error of its rotation, radians."""
@@ -44,42 +44,33 @@ class Sightings:
     """(n, 6, q) errors that all share, of one standard deviation each."""
     fit: CornerFit | None = None
     """What the corners say, where there are corners."""
-    size: float = SIZE_SIGMA
-    """Relative error of the board's size."""
+
+    @property
+    def distance(self) -> float:
+        """Median distance of the board, metres."""
+        return float(np.median(norms(self.poses.translation_m)))
 
     @classmethod
     def of(
         cls,
         name: str,
         table: PoseRows,
-        moments: Sequence[str],
+        moments: Strings,
     ) -> "Sightings":
         """The images of a table that show the board."""
         rows = np.flatnonzero(table.measured)
         if not len(rows):
             raise InputError(f"{name}: no image shows the board")
+        names = table.row_names()
+        images = tuple(names[row] for row in rows)
+        shown = tuple(moments[row] for row in rows)
         poses = table.poses[rows]
-        fit = None
         if corners := table.corners_of(rows):
             fit = corner_fit(corners, poses)
-            poses = fit.poses
-            own = fit.covariance
-            shared = fit.slopes
-        else:
-            own = _usual(poses)
-            shared = SIZE_SIGMA * poses.translation_m * [0, 0, 1]
-            shared = np.pad(shared, ((0, 0), (0, 3)))[..., None]
-        names = table.row_names()
-        images = tuple(names[row] for row in rows.tolist())
-        return cls(
-            name,
-            images,
-            tuple(moments[row] for row in rows.tolist()),
-            poses,
-            own,
-            shared,
-            fit,
-        )
+            return cls(name, images, shown, fit.poses, fit.covariance, fit.slopes, fit)
+        depth = SIZE_SIGMA * poses.translation_m * [0, 0, 1]
+        shared = np.pad(depth, ((0, 0), (0, 3)))[..., None]
+        return cls(name, images, shown, poses, _usual(poses), shared)
 
 
 def read_sightings(
@@ -89,7 +80,7 @@ def read_sightings(
 ) -> list[Sightings]:
     """Read camera_from_board of every camera and pair their images.
 
-    By names without folder and ending, by the numbers in them, by times, or in order.
+    By names without folder and ending, by the numbers in them, or in order.
     """
     names = [file.stem for file in files]
     if len({*names}) < len(names):
@@ -100,8 +91,8 @@ def read_sightings(
             " left.json right.json"
         )
     tables = [read_camera_poses(file, convention, inverted) for file in files]
-    rows = zip(names, tables, _moments(tables, names), strict=True)
-    return [Sightings.of(*row) for row in rows]
+    moments = _moments(tables)
+    return [*map(Sightings.of, names, tables, moments)]
 
 
 def _usual(
@@ -120,52 +111,48 @@ def _usual(
 
 def _moments(
     tables: Sequence[PoseRows],
-    cameras: Strings | list[str],
-) -> list[list[str]]:
+) -> list[Strings]:
     """Names of the moments of all rows."""
+    names = [tuple(map(without_ending, table.row_names())) for table in tables]
     if all(table.names for table in tables):
-        names = [[*map(without_ending, table.row_names())] for table in tables]
         if any({*first} & {*second} for first, second in combinations(names, 2)):
             return names
-        return [[str(last_number(name)) for name in own] for own in names]
-    stamps = [table.stamps_s for table in tables if table.stamps_s is not None]
-    if len(stamps) == len(tables):
-        every = np.sort(np.concatenate(stamps))
-        first = every[np.r_[True, np.diff(every) > _APART_S]]
-        return [[*map(str, np.searchsorted(first, own, "right"))] for own in stamps]
-    counts = [len(table.poses) for table in tables]
+        return [tuple(str(last_number(name)) for name in own) for own in names]
+    counts = [len(own) for own in names]
     if len({*counts}) > 1:
-        listed = ", ".join(map("{} {}".format, cameras, counts))
         raise InputError(
-            f"`camera_poses`: the files differ in their number of poses ({listed}); give images of"
-            " one moment one name, in a column image"
+            f"`camera_poses`: the files hold {counts} poses; give images of one moment one name, in"
+            " a column image"
         )
-    return [[*map(str, range(count))] for count in counts]
+    return [names[0] for _ in names]
 
 
-def require_connected(
-    cameras: Sequence[Sightings],
-) -> None:
-    """Refuse cameras that share no moment with the others, by name."""
-    parts: list[list[Sightings]] = []
-    for camera in cameras:
-        apart = []
-        joined = [camera]
-        for part in parts:
-            if any({*camera.moments} & {*other.moments} for other in part):
-                joined = part + joined
-            else:
-                apart.append(part)
-        parts = [*apart, joined]
-    if len(parts) == 1:
-        return
-    listed = []
-    for part in parts:
-        names = " + ".join(camera.name for camera in part)
-        images = part[0].images
-        listed.append(f"{names} ({counted(len(images), 'image')}, first {images[0]})")
-    raise InputError(
-        f"`camera_poses`: cameras in {len(parts)} parts never saw the board at one moment:"
-        f" {'; '.join(listed)}. Record images in which cameras of two parts see it; images of one"
-        " moment have one name"
+def image_uses(
+    names: Sequence[str],
+    used: BoolArray,
+    mm: Array,
+) -> tuple[ImageUse, ...]:
+    """The use of images or points, by whether they agree and how far they are off."""
+    uses = []
+    for name, agrees, miss in zip(names, used.tolist(), mm.tolist(), strict=True):
+        reason = "" if agrees else f"is {miss:.1f} mm from where the others put it"
+        uses.append(ImageUse(name, agrees, reason, miss))
+    return tuple(uses)
+
+
+def judged(
+    calibration: Calibration,
+    fit: CornerFit | None = None,
+) -> Calibration:
+    """The calibration with its intrinsics, its verdict and the number of its images or points."""
+    checks = replace(
+        calibration.checks,
+        poses_given=len(calibration.images),
+        poses_used=sum(image.used for image in calibration.images),
+        corner_sigma_px=fit.sigma_px if fit else None,
     )
+    calibration = replace(calibration, checks=checks)
+    if fit:
+        camera = fit.lens.camera
+        calibration = replace(calibration, camera=camera, lenses=fit.lenses)
+    return replace(calibration, verdict=verdict(calibration))

@@ -1,15 +1,15 @@
 """A fixed camera by touched points and their pixels: a pose from points, without a map."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from evercal.calibration.boards.corners import BoardView, board_pose
 from evercal.calibration.calibration import Calibration
+from evercal.calibration.checks import Checks
 from evercal.calibration.fixed.corner_fit import corner_fit
-from evercal.calibration.fixed.sightings import Sightings
-from evercal.calibration.fixed.solved import image_uses, judged, solve_still
+from evercal.calibration.fixed.sightings import image_uses, judged
+from evercal.calibration.fixed.still import still_pose
 from evercal.calibration.from_map.align import require_spread
 from evercal.calibration.picked_points import PickedPoint
 from evercal.calibration.pose_pairs.pairs import BoardCorners
@@ -63,8 +63,9 @@ def solve_picks(
     view = BoardView(places, np.stack([pick.pixel for pick in picks]))
     labels = [f"{pick.point} in {pick.image}" for pick in picks]
     try:
-        start = board_pose(view, camera).camera_from_board
-        distance = norms(start.apply(places)).mean()
+        distance = norms(
+            board_pose(view, camera).camera_from_board.apply(places)
+        ).mean()
         usual_px = float(np.hypot(pick_px, camera.fx * touch_m / distance))
         limit = _SIGMAS * usual_px + _LENS_SHARE * camera.width
         used = _agreeing(view, labels, camera, limit)
@@ -74,21 +75,23 @@ def solve_picks(
     start = board_pose(view[used], camera).camera_from_board
     fit = corner_fit(corners, SE3.stack([start]), usual_px)
     fit.require_one_pose()
-    seen = Sightings(
-        "camera", ("picks",), ("",), fit.poses, fit.covariance, fit.slopes, fit, 0.0
-    )
     # Of the touches a part is the tool's, which all share.
-    base = UncertainPose(SE3.identity(), np.diag(np.repeat([touch_m**2, 1e-8], 3)))
-    calibration = solve_still([seen], base)["camera"]
+    tool = UncertainPose(SE3.identity(), np.diag([touch_m**2] * 3 + [1e-8] * 3))
+    pose = tool @ still_pose(fit).inverse()
     miss = norms(view.pixels - fit.lens.camera.project(fit.poses[0].apply(places)))
     misses = 1000 * miss * distance / camera.fx
-    checks = replace(
-        calibration.checks,
+    checks = Checks(
         residual_mm=float(np.sqrt((misses[used] ** 2).mean())),
+        residual_deg=0.0,
         target_m=float(distance),
     )
     images = image_uses(labels, used, misses)
-    return judged(replace(calibration, images=images, checks=checks))
+    return judged(
+        Calibration(
+            "eye_to_hand", pose.pose, pose.covariance, images=images, checks=checks
+        ),
+        fit,
+    )
 
 
 def _agreeing(
