@@ -1,6 +1,7 @@
 """Whether distances to the board err together with the focal length: a lens that was focused again.
 
-Another focal length moves the board along its viewing ray, by a share of its distance.
+Another focal length moves the board along its viewing ray, by a share of its distance. Noise of the
+corners does so, too: where it is unknown, only one step over the recording counts.
 """
 
 from collections.abc import Sequence
@@ -32,12 +33,16 @@ def focus_warning(
     shift = fit.residual[:, :3]
     along = (shift * direction).sum(1)
     across = norms(shift - along[:, None] * direction) / np.sqrt(2)
-    sigma = _BESIDE * np.median(across) / distance
+    known = equation.system(fit.at).known[:, :3, :3]
+    by_corners = np.einsum("ni,nij,nj->n", direction, known, direction)
+    sigma = np.hypot(_BESIDE * np.median(across), np.sqrt(by_corners)) / distance
     share = np.stack([along / distance, np.maximum(sigma, _LEAST_SIGMA)], 1)
     order = np.argsort(rows)
-    order = order[fit.inliers[order]]
     change = LensChange.of(share[order])
-    if not change.size:
+    if change.first < 0:
+        order = order[fit.inliers[order]]
+        change = LensChange.of(share[order])
+    if not change.size or (change.first < 0 and not by_corners.any()):
         return []
     how = f"by {100 * change.size:.1f} % (standard deviation) from image to image"
     if change.first >= 0:

@@ -129,12 +129,11 @@ def solve_pose_pairs(
     warnings: list[str] = []
     if scale_known:
         equation, fit, warnings = with_tested_size(equation, fit, corners, of_board)
-    warnings += focused
-    if not slip:
-        warnings += second_group(equation, fit, rows, pairs.names)
-    else:
+    if slip:
         fit = replace(fit, covariance=fit.covariance + slip.spread)
         warnings.append(_slip_warning(slip, pairs.names, of_board))
+    else:
+        warnings += focused or second_group(equation, fit, rows, pairs.names)
     if corners and lens:
         warnings += corner_warnings(fit, equation, corners, lens)
     if of_board:
