@@ -128,3 +128,23 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
 def test_wrong_maps_are_refused(tmp_path: Path, entries: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
         read(tmp_path, "a,b,c", "1,2,3", entries)
+
+
+@pytest.mark.parametrize("row", ["0.1,0.2,0.3", "-1,90,4", "0,0,0"])
+def test_rows_without_names_are_told_the_joints_of_the_urdf(
+    tmp_path: Path, row: str
+) -> None:
+    (tmp_path / "arm.urdf").write_text(URDF)
+    file = tmp_path / "joints.csv"
+    file.write_text(f"a.png,{row}\nb.png,{row}\n")
+    with pytest.raises(InputError, match=r"no names of joints; .* has J1,J2,J3$"):
+        read_joint_poses(file, RobotModel(tmp_path / "arm.urdf"))
+
+
+def test_numbers_of_motors_are_names(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(URDF)
+    file = tmp_path / "joints.csv"
+    file.write_text("image,1,2,3\na.png,0.1,0.2,0.3\n")
+    poses, _ = read_joint_poses(file, RobotModel(tmp_path / "arm.urdf"))
+    assert poses.joints is not None
+    assert poses.joints.tolist() == [[0.1, 0.2, 0.3]]

@@ -13,7 +13,12 @@ import numpy as np
 from evercal.errors import InputError
 from evercal.recordings.poses.pose_track import times_around
 from evercal.recordings.poses.robot_poses import RobotPoses
-from evercal.recordings.poses.row_files import LabelledRows, read_rows, row_labels
+from evercal.recordings.poses.row_files import (
+    LabelledRows,
+    is_number,
+    read_rows,
+    row_labels,
+)
 from evercal.recordings.read_options import ReadOptions
 from evercal.robot.joint_map import JointMap
 from evercal.robot.joint_names import joints_by_column
@@ -68,6 +73,13 @@ def joint_reading(
     joints = model.arm(*links).joints
     if model.whole:
         joints = model.drivers()
+    numbers = [float(column) for column in columns if is_number(column)]
+    # Motors may be numbered; other numbers are the first row.
+    if len(numbers) == len(columns) and np.any(np.diff(numbers) != 1):
+        raise InputError(
+            f"{source}: its rows have no names of joints; write them as its first line, in the"
+            f" order of the columns; {model.path} has {','.join(joints)}"
+        )
     found = joints_by_column(names, joints, not model.whole)
     named = [found.get(name, name) for name in names]
     with named_errors(str(source), "joint angles"):
