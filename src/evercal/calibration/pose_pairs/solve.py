@@ -26,7 +26,6 @@ from evercal.calibration.pose_pairs.fit import (
     robust_fit,
 )
 from evercal.calibration.pose_pairs.mistakes import require_agreement
-from evercal.calibration.pose_pairs.noise_levels import evidence_of_shared
 from evercal.calibration.pose_pairs.pairs import (
     BoardCorners as BoardCorners,
     Measured,
@@ -36,14 +35,15 @@ from evercal.calibration.pose_pairs.pairs import (
 )
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation, Unknowns
 from evercal.calibration.pose_pairs.second_group import second_group
-from evercal.calibration.pose_pairs.slips import Slip, find_slip
+from evercal.calibration.pose_pairs.shared import with_shared
+from evercal.calibration.pose_pairs.slips import Slip
 from evercal.calibration.pose_pairs.solution import PairSolution
 from evercal.calibration.pose_pairs.starts import quick_fit
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
 from evercal.geometry import SE3, cross_matrix, norms, pose_distance
 from evercal.robot.mount import MountName, mount_named
-from evercal.robot.pose_errors import WANTED, ArmErrors, shared_errors
+from evercal.robot.pose_errors import ArmErrors
 from evercal.storage.provenance import call
 from evercal.typing import BoolArray, IntArray
 
@@ -122,7 +122,7 @@ def solve_pose_pairs(
     problem = _Problem(mount, scale, scale_known, corners, of_board)
     equation, fit, lens = problem.fitted(pairs, rows, start.at, lens)
     plain = equation, fit
-    equation, fit, slip = _with_shared(pairs, rows, errors, equation, fit)
+    equation, fit, slip = with_shared(pairs, rows, errors, equation, fit)
     focused = []
     if of_board and not slip:
         focused = focus_warning(*plain, rows, pairs.names)
@@ -151,27 +151,6 @@ def solve_pose_pairs(
         corners=corners,
         lens=lens,
     )
-
-
-def _with_shared(
-    pairs: PosePairs,
-    rows: IntArray,
-    errors: ArmErrors,
-    equation: PoseEquation,
-    fit: HandEyeFit,
-) -> tuple[PoseEquation, HandEyeFit, Slip | None]:
-    """Find a step, or take in errors that poses share: one looks like the other."""
-    slip = find_slip(equation, fit, rows)
-    kinds = shared_errors(pairs.base_from_gripper, errors)
-    shared = {name: kind.of_rows(rows) for name, kind in kinds.items()}
-    sharing = replace(equation, shared=shared)
-    evidence = evidence_of_shared(sharing[fit.inliers].system(fit.at))
-    if slip and slip.evidence >= evidence:
-        return equation, fit, slip
-    if evidence > WANTED:
-        fit = robust_fit(sharing, agreement(sharing, fit.at))
-        equation = sharing
-    return equation, fit, None
 
 
 def _require_agreement(
