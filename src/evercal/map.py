@@ -194,6 +194,7 @@ class Map(LearnedScenes):
         boards: Mapping[str, SE3] | None = None,
         points: Mapping[str, np.ndarray] | None = None,
         picks: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]] = (),
+        distances: Mapping[tuple[str, str], float] | None = None,
         unknown_scale: bool = False,
         base_frame: str | None = None,
     ) -> MapAlignment:
@@ -207,6 +208,8 @@ class Map(LearnedScenes):
             boards: camera_from_board by image name, for a fixed camera and a board in the gripper.
             points: Instead of images: (3,) touched points by name in the base frame, metres.
             picks: Name, image (H, W, 3) and pixels (2,) by name of the point, of each image.
+            distances: Instead of points: metres between two picked points. The frame of the scene
+                stays its own.
             unknown_scale: Estimate the scale also where the recording was in metres.
             base_frame: Name of the base frame.
 
@@ -221,7 +224,13 @@ class Map(LearnedScenes):
         with self._store.writing():
             own = self.localizer.contents.scene(scene)
             scale_known = own.unit is None and not unknown_scale
-            if points is not None:
+            if distances:
+                from evercal.calibration.from_map.known_distance import (
+                    align_by_distances,
+                )
+
+                found = align_by_distances(self.localizer, scene, distances, picks)
+            elif points is not None:
                 found = align_by_points(
                     self.localizer, scene, points, picks, scale_known
                 )

@@ -18,6 +18,7 @@ from evercal.calibration.from_map.align import (
     align_by_points,
     fit_picks,
 )
+from evercal.calibration.from_map.known_distance import align_by_distances
 from evercal.calibration.image_source import Images
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
@@ -176,6 +177,18 @@ def test_touched_points_determine_the_base(
     )
     with pytest.raises(InputError, match="of 1 images with picks"):
         align_by_points(localizer, "hall", points, picks[:1])
+    apart = float(np.linalg.norm(points["p1"] - points["p0"]))
+    other = float(np.linalg.norm(points["p2"] - points["p0"]))
+    distances = {("p0", "p1"): apart, ("p0", "p2"): other}
+    by_distance = align_by_distances(localizer, "hall", distances, picks)
+    assert by_distance.similarity.scale == pytest.approx(scale, rel=0.01)
+    assert not by_distance.warnings
+    assert by_distance.sigma[0] > 0
+    distances["p0", "p1"] *= 1.2
+    wrong = align_by_distances(localizer, "hall", distances, picks)
+    assert "the distances disagree by" in wrong.warnings[0]
+    with pytest.raises(InputError, match="point nowhere was not picked"):
+        align_by_distances(localizer, "hall", {("p0", "nowhere"): 1.0}, picks)
 
 
 def test_too_few_images_and_unknown_scenes_are_refused(

@@ -40,6 +40,9 @@ class Align(args.Verb):
     """Touched points in the base frame: lines of name, x, y, z in metres."""
     picks: args.File = None
     """Points in images: lines of image, name, u, v in pixels; images relative to this file."""
+    distance: tuple[str, ...] = ()
+    """Metres between two picked points, such as A,B=0.297, in place of --points: the scene keeps
+    its own frame."""
     base_frame: args.Frame = None
     """Name of the base frame, which goes into exports."""
     unknown_scale: bool = False
@@ -50,7 +53,7 @@ class Align(args.Verb):
         by_points = self.points is not None or self.picks is not None
         if by_points == (self.robot_poses is not None):
             raise InputError(
-                "give either images with --robot-poses, or --points with --picks"
+                "give either images with --robot-poses, or --points or --distance with --picks"
             )
         others = (*self.images, self.convention, self.board_poses)
         if by_points and any(others):
@@ -100,19 +103,22 @@ class Align(args.Verb):
         from evercal.calibration.picked_points import read_picks, read_points
         from evercal.recordings import read_image
 
-        if not self.points or not self.picks:
-            raise InputError("--points and --picks belong together; give both")
-        points = read_points(self.points)
+        if not self.picks or bool(self.points) == bool(self.distance):
+            raise InputError("give --picks with either --points or --distance")
+        points = None
+        if self.points:
+            points = read_points(self.points)
         by_image: dict[str, dict[str, np.ndarray]] = {}
         for image, name, pixel, _ in read_picks(self.picks):
-            if name not in points:
+            if points is not None and name not in points:
                 raise InputError(
                     f"{self.picks}: point {name!r} is not in {self.points}"
                 )
             by_image.setdefault(image, {})[name] = pixel
         folder = self.picks.parent
         picks = [(name, read_image(folder / name), p) for name, p in by_image.items()]
-        return {"points": points, "picks": picks}
+        distances = dict(map(_distance, self.distance))
+        return {"points": points, "picks": picks, "distances": distances}
 
     def _show(self, alignment: "MapAlignment", unit: float) -> None:
         """Print it; `unit` is that of the recording, per unit of the map."""
@@ -144,3 +150,15 @@ class Align(args.Verb):
             *lines,
             then=("calibrate", self.store, "IMAGE..."),
         )
+
+
+def _distance(text: str) -> tuple[tuple[str, str], float]:
+    """The names and metres of A,B=0.297."""
+    ends, _, metres = text.partition("=")
+    first, _, second = ends.partition(",")
+    try:
+        return (first, second), float(metres)
+    except ValueError:
+        raise InputError(
+            f"--distance {text}: give two picked points and metres, such as A,B=0.297"
+        ) from None

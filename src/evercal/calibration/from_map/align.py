@@ -196,6 +196,31 @@ def align_by_points(
         picks: (name, (h, w, 3) uint8 RGB, pixels (2,) by name of the point) of each image.
         scale_known: Whether the scene was learned in metres.
     """
+    images = located_picks(localizer, scene, points, picks)
+    similarity, whole, residual_px = fit_picks(images, scale_known)
+    positions = np.stack([*points.values()])
+    middle = np.mean([*points.values()], axis=0)
+    radius = np.sqrt(((positions - middle) ** 2).sum(1).mean() / 3)
+    covariance = whole[:6, :6].copy()
+    covariance[:3, :3] += np.eye(3) * whole[6, 6] * radius**2
+    return MapAlignment(
+        similarity,
+        covariance,
+        len(points),
+        len(points),
+        f"{residual_px:.1f} px root mean square",
+        None,
+        axis_deviation(_about(-middle, whole[:6, :6])),
+    )
+
+
+def located_picks(
+    localizer: "Localizer",
+    scene: str,
+    points: Mapping[str, Array],
+    picks: Sequence[tuple[str, Image, Mapping[str, Array]]],
+) -> "list[Picks]":
+    """Picks of the images that are located in the own frame of a scene, two at least."""
     localizer = _in_own_frame(localizer, scene)
     images = []
     learned = localizer.contents.scene(scene)
@@ -219,21 +244,7 @@ def align_by_points(
             f"{len(images)} of {len(picks)} images with picks were located in {scene}; at least"
             " two are needed"
         )
-    similarity, whole, residual_px = fit_picks(images, scale_known)
-    positions = np.stack([*points.values()])
-    middle = np.mean([*points.values()], axis=0)
-    radius = np.sqrt(((positions - middle) ** 2).sum(1).mean() / 3)
-    covariance = whole[:6, :6].copy()
-    covariance[:3, :3] += np.eye(3) * whole[6, 6] * radius**2
-    return MapAlignment(
-        similarity,
-        covariance,
-        len(points),
-        len(points),
-        f"{residual_px:.1f} px root mean square",
-        None,
-        axis_deviation(_about(-middle, whole[:6, :6])),
-    )
+    return images
 
 
 def _about(point: Array, covariance: Array) -> Array:
@@ -265,14 +276,14 @@ def fit_picks(
     Also return the covariance (7, 7) of a small motion (v, w) of the base frame and of the
     logarithm of the scale, and the root mean square distance of the picks in pixels.
     """
-    triangulated = _triangulated(images)
-    if len(triangulated) < 3:
+    found = triangulated(images)
+    if len(found) < 3:
         raise InputError(
-            f"{len(triangulated)} points were picked in two or more images; give at least three,"
+            f"{len(found)} points were picked in two or more images; give at least three,"
             " each in two images from different places"
         )
-    in_map = np.stack([point for point, _ in triangulated.values()])
-    in_base = np.stack([point for _, point in triangulated.values()])
+    in_map = np.stack([point for point, _ in found.values()])
+    in_base = np.stack([point for _, point in found.values()])
     start = umeyama(in_map, in_base, scale_known)
     centre = in_base.mean(0)
     before = start.base_from_map.rotation
@@ -313,7 +324,7 @@ def _distances(image: Picks, similarity: Similarity) -> Array:
     return np.nan_to_num(pixels - image.pixels, nan=1e3).ravel()
 
 
-def _triangulated(images: Sequence[Picks]) -> dict[str, ArrayPair]:
+def triangulated(images: Sequence[Picks]) -> dict[str, ArrayPair]:
     """Return each point that two images show in the map and in the base, by name."""
     centres = defaultdict(list)
     across = defaultdict(list)
