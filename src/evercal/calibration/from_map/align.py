@@ -238,7 +238,8 @@ def located_picks(
             )
         touched = np.stack([points[key] for key in pixels])
         picked = np.stack([*pixels.values()])
-        images.append(Picks(item.pose, camera, touched, tuple(pixels), picked))
+        sigma = float(np.sqrt(np.trace(item.covariance[:3, :3]) / 3))
+        images.append(Picks(item.pose, camera, touched, tuple(pixels), picked, sigma))
     if len(images) < 2:
         raise InputError(
             f"{len(images)} of {len(picks)} images with picks were located in {scene}; at least"
@@ -266,6 +267,8 @@ class Picks(NamedTuple):
     names: Strings
     pixels: Array
     """(k, 2)."""
+    sigma_m: float = 0.0
+    """Standard deviation of the position of the camera per axis, unit of the map."""
 
 
 def fit_picks(

@@ -42,6 +42,8 @@ def align_by_distances(
     places = triangulated(images)
     logarithms = []
     variances = []
+    # Errors of poses by the intrinsics are common to all images.
+    by_poses = 2 * max(image.sigma_m for image in images) ** 2
     for (first, second), metres in distances.items():
         for name in (first, second):
             if name not in places:
@@ -61,7 +63,7 @@ def align_by_distances(
             _covariance(images, name, places[name][0]) for name in (first, second)
         ]
         along = between / length
-        variances.append(float(along @ sum(spread) @ along) / length**2)
+        variances.append(float(along @ sum(spread) @ along + by_poses) / length**2)
     weight = 1 / np.array(variances)
     mean = float(np.average(logarithms, weights=weight))
     off = np.abs(np.array(logarithms) - mean)
