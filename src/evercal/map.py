@@ -208,16 +208,15 @@ class Map(LearnedScenes):
             boards: camera_from_board by image name, for a fixed camera and a board in the gripper.
             points: Instead of images: (3,) touched points by name in the base frame, metres.
             picks: Name, image (H, W, 3) and pixels (2,) by name of the point, of each image.
-            distances: Instead of points: metres between two picked points. The frame of the scene
-                stays its own.
+            distances: Instead of points: metres between picked points; the frame stays its own.
             unknown_scale: Estimate the scale also where the recording was in metres.
             base_frame: Name of the base frame.
 
         Raises:
-            InputError: No such scene, too few images or points, or another process writes into the
-                map. The map is unchanged.
+            InputError: No such scene, too few images or points, or another process writes a map.
         """
         from evercal.calibration.from_map.align import align_by_gripper, align_by_points
+        from evercal.calibration.from_map.known_distance import by_distances
         from evercal.calibration.image_source import Images
         from evercal.learning.mapped_already import placed
 
@@ -225,11 +224,7 @@ class Map(LearnedScenes):
             own = self.localizer.contents.scene(scene)
             scale_known = own.unit is None and not unknown_scale
             if distances:
-                from evercal.calibration.from_map.known_distance import (
-                    align_by_distances,
-                )
-
-                found = align_by_distances(self.localizer, scene, distances, picks)
+                found = by_distances(self.localizer, scene, distances, picks)
             elif points is not None:
                 found = align_by_points(
                     self.localizer, scene, points, picks, scale_known

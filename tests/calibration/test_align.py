@@ -18,7 +18,7 @@ from evercal.calibration.from_map.align import (
     align_by_points,
     fit_picks,
 )
-from evercal.calibration.from_map.known_distance import align_by_distances
+from evercal.calibration.from_map.known_distance import by_distances
 from evercal.calibration.image_source import Images
 from evercal.errors import InputError
 from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
@@ -180,17 +180,17 @@ def test_touched_points_determine_the_base(
     apart = float(np.linalg.norm(points["p1"] - points["p0"]))
     other = float(np.linalg.norm(points["p2"] - points["p0"]))
     distances = {("p0", "p1"): apart, ("p0", "p2"): other}
-    by_distance = align_by_distances(localizer, "hall", distances, picks)
+    by_distance = by_distances(localizer, "hall", distances, picks)
     near = 0.01 if longer == 1 else 0.03
     assert by_distance.similarity.scale == pytest.approx(scale, rel=near)
     assert not by_distance.warnings
     assert by_distance.sigma[0] > 0
     distances["p0", "p1"] *= 1.5
-    wrong = align_by_distances(localizer, "hall", distances, picks)
+    wrong = by_distances(localizer, "hall", distances, picks)
     # The lens that is 10 % longer than stated leaves the scale of a flat wall too open.
     assert (longer != 1) or "the distances disagree by" in wrong.warnings[0]
     with pytest.raises(InputError, match="point nowhere was not picked"):
-        align_by_distances(localizer, "hall", {("p0", "nowhere"): 1.0}, picks)
+        by_distances(localizer, "hall", {("p0", "nowhere"): 1.0}, picks)
 
 
 def test_too_few_images_and_unknown_scenes_are_refused(

@@ -95,6 +95,7 @@ def test_options_are_those_of_load_recording(run):
     assert names.pop("format") is None
     options = {field.name: field.default for field in dataclasses.fields(ReadOptions)}
     assert options.pop("whole_robot") is False  # `arm-in-view` reads so
+    assert options.pop("unchecked_joints") is False  # `inspect` checks them itself
     assert names == options
     text = run("inspect --help").out.replace("│", "")
     page = " ".join(text.split())

@@ -26,7 +26,7 @@ SIGNIFICANT = 4.0
 """Disagreement of two distances that is reported, standard deviations."""
 
 
-def align_by_distances(
+def by_distances(
     localizer: "Localizer",
     scene: str,
     distances: Mapping[Ends, float],
