@@ -15,6 +15,7 @@ def test_experiments_have_valid_options_and_folders_of_their_own() -> None:
     folders = {experiment.out for of in known.values() for experiment in of}
     assert len(folders) == 13, "the gate is a part of experiment A"
     for experiment in (experiment for of in known.values() for experiment in of):
+        assert experiment.data is not None
         assert experiment.data.parent == Path("rooms")
         assert experiment.data.name.removesuffix("-480") == experiment.suite
         assert experiment._stage(0).fit.iterations >= networks.STEPS

@@ -208,6 +208,7 @@ def test_landmarks_are_tracked_again_after_noticeable_changes(
         weight=np.ones(10),
         covariance=zero,
         inverse_depth=np.full(7, 0.5),
+        focal_changes=np.full((3, 2), np.nan),
         offsets=np.zeros(0),
         offsets_covariance=np.zeros((0, 0)),
         offsets_prior=np.zeros(0),

@@ -48,10 +48,11 @@ def written(text: str, at: tuple[int, int], bar: int | None) -> Overlay:
     def draw(number: int, image: Image) -> Image:
         y = at[1]
         if bar is not None:
-            image = cv2.rectangle(image, (0, y - 16), (WIDTH, y + 5), (bar,) * 3, -1)
+            image[max(y - 16, 0) : y + 6] = bar
         colour = (255 - (bar or 0),) * 3
         font = cv2.FONT_HERSHEY_SIMPLEX
-        return cv2.putText(image, text.format(number), at, font, 0.45, colour, 1)
+        cv2.putText(image, text.format(number), at, font, 0.45, colour, 1)
+        return image
 
     return draw
 

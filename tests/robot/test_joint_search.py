@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
+from evercal.robot.joint_agreement import OFFSET, JointTest
 from evercal.robot.joint_search import JointVerdict, joint_search
-from evercal.robot.joint_test import OFFSET, JointTest
 from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND, Mount
 from evercal.typing import Array
 

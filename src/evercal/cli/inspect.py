@@ -81,7 +81,7 @@ class Inspect(args.Verb):
             joint_sentence,
             recorded_joints,
         )
-        from evercal.robot.joint_test import OFFSET
+        from evercal.robot.joint_agreement import OFFSET
         from evercal.robot.mount import EYE_IN_HAND, EYE_TO_HAND
         from evercal.storage import write_json
 

@@ -63,7 +63,7 @@ def without_fixed_pixels(recording: Recording) -> tuple[Recording, float]:
 def fixed_pixels(greys: Sequence[Image]) -> BoolArray:
     """(h, w) what is the same in all images (h, w), and gaps between it; none if most is."""
     compared = repeats(greys, equal=SMOOTH)
-    fixed = compared.count.mean(0) >= ALWAYS * (len(greys) - 1)
+    fixed = compared.images.mean(0) >= ALWAYS * (len(greys) - 1)
     none = np.zeros_like(fixed)
     if len(greys) < FEWEST or fixed.mean() > MOST * compared.textured.mean():
         return none

@@ -159,7 +159,8 @@ def _mask(root: Path, names: list[str]) -> Path | None:
     [(height, width)] = sizes
     keep = cv2.resize(keep, (width, height), interpolation=cv2.INTER_NEAREST)
     path = root / "mask.png"
-    write_image(path, np.repeat(keep[..., None], 3, 2))
+    grey = np.repeat(keep[..., None], 3, 2)
+    write_image(path, np.asarray(grey, np.uint8))
     return path
 
 

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from evercal.typing import BoolArray, Float32Array, Image, IntArray
+from evercal.typing import BoolArray, Float32Array, Image
 
 PATCH_PX = 9
 """Side of a patch."""
@@ -22,7 +23,7 @@ LEAST_NOISE = 2.0
 class Repeats(NamedTuple):
     """Patches around the pixels of n images (h, w)."""
 
-    count: IntArray
+    images: NDArray[np.int16]
     """(n, h, w) images that repeat the patch."""
     textured: BoolArray
     """(n, h, w) whether it shows more than noise."""

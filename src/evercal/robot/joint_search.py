@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from evercal.robot.arm import Arm
+from evercal.robot.joint_agreement import FREEDOM, OFFSET, SPREAD, JointTest
 from evercal.robot.joint_map import UNITS
-from evercal.robot.joint_test import FREEDOM, OFFSET, SPREAD, JointTest
 from evercal.typing import Array, IntArray, Strings
 
 AGREE_DEG = 2.0

@@ -10,8 +10,8 @@ from evercal.features.encoder import load_encoder
 from evercal.geometry import SE3, spread
 from evercal.recordings.frame import MIN_TRAIN_FRAMES, Recording
 from evercal.robot.arm import Arm
+from evercal.robot.joint_agreement import JointTest, PairMotions, chords
 from evercal.robot.joint_search import JointVerdict, joint_search
-from evercal.robot.joint_test import JointTest, PairMotions, chords
 from evercal.robot.mount import Mount
 from evercal.typing import Array
 

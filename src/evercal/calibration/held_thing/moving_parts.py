@@ -65,7 +65,7 @@ def _still(greys: Sequence[Image]) -> tuple[BoolArray, BoolArray]:
     """(n, h, w) whether a patch is repeated at its place, and whether it shows anything."""
     apart = -(-len(greys) // COMPARED)
     compared = repeats(greys, apart)
-    return compared.count >= STILL_IMAGES, compared.textured
+    return compared.images >= STILL_IMAGES, compared.textured
 
 
 def _opened(moving: BoolArray) -> BoolArray:

@@ -46,7 +46,7 @@ def focus_warning(
         return []
     how = f"by {100 * change.size:.1f} % (standard deviation) from image to image"
     if change.first >= 0:
-        at = names[rows[order[change.first]]]
+        at = names[int(rows[order[change.first]])]
         how = f"by {100 * abs(change.size):.1f} % at {at}"
     return [
         f"distances from camera to board change {how}, positions across them hardly: does the"
