@@ -162,6 +162,7 @@ def test_views_from_four_places_are_no_overlay() -> None:
 
 def test_few_images_are_not_compared() -> None:
     assert not fixed_pixels(greys(OVERLAYS["palm"], 4)).any()
+    assert not fixed_pixels(greys(OVERLAYS["palm"], 1)).any()
 
 
 def test_training_images_lack_it_and_test_images_keep_it() -> None:

@@ -1,5 +1,6 @@
 """A scene from a camera on the gripper whose recording states gripper poses only."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from time import perf_counter
 
@@ -20,7 +21,7 @@ from evercal.mapping.memory_budget import MemoryBudget
 from evercal.mapping.scene_map import MapContents, SceneMap
 from evercal.progress import OnProgress
 from evercal.recordings.fixed_pixels import without_fixed_pixels
-from evercal.recordings.frame import MIN_TRAIN_FRAMES, Recording
+from evercal.recordings.frame import MIN_TRAIN_FRAMES, Frame, Recording
 from evercal.recordings.held_out import HeldOutSplit, split_held_out
 from evercal.robot.mount import EYE_IN_HAND
 
@@ -42,11 +43,12 @@ def learn_wrist(
     `gripper_from_camera` is a rough one that the estimate is compared with.
     """
     began = perf_counter()
+    frames = gripper_frames(recording)
     shown, fixed_share = without_fixed_pixels(recording)
     try:
         posed, start = _posed_by_gripper(shown, contents, on_progress)
     except InputError as error:
-        raise InputError(f"{recording.name}: {error}{_still(recording)}") from None
+        raise InputError(f"{recording.name}: {error}{_still(frames)}") from None
     split = split_held_out(posed.train)
     if len(split.held_out) < LEAST_ANSWERS:
         split = HeldOutSplit(posed.train, ())
@@ -68,9 +70,8 @@ def _posed_by_gripper(
     return start.posed(recording, frames), start
 
 
-def _still(recording: Recording) -> str:
+def _still(frames: Sequence[Frame]) -> str:
     """A hint where the camera looks fixed."""
-    frames = gripper_frames(recording)
     still = moving_parts(frames)[1]
     if still < STILL_SHARE:
         return ""

@@ -32,7 +32,6 @@ LEAST = 2e-3
 """Smallest share of the image. Letters of one word have more."""
 BETWEEN_PX = 15
 """Gaps between fixed patches that are closed, pixels: between letters and lines of text."""
-
 MARGIN_PX = 7
 """Width by which fixed patches grow, pixels: their edges, and digits that change."""
 
@@ -62,10 +61,12 @@ def without_fixed_pixels(recording: Recording) -> tuple[Recording, float]:
 
 def fixed_pixels(greys: Sequence[Image]) -> BoolArray:
     """(h, w) what is the same in all images (h, w), and gaps between it; none if most is."""
+    none = np.zeros(greys[0].shape, bool)
+    if len(greys) < FEWEST:
+        return none
     compared = repeats(greys, equal=SMOOTH)
     fixed = compared.images.mean(0) >= ALWAYS * (len(greys) - 1)
-    none = np.zeros_like(fixed)
-    if len(greys) < FEWEST or fixed.mean() > MOST * compared.textured.mean():
+    if fixed.mean() > MOST * compared.textured.mean():
         return none
     patches = fixed.astype(np.uint8)
     patches = cv2.morphologyEx(patches, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
