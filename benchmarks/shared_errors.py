@@ -52,7 +52,7 @@ SMOOTH = {
 """Sizes of errors as in real recordings, metres and radians."""
 LEFT_OUT = ("joint offsets", "smooth", "drift", "_PSEUDO", "_AT_ZERO")
 """Kinds of errors, and constants of `noise_levels`, that rows leave out."""
-SOLVE = "evercal.calibration.pose_pairs.solve.shared_errors"
+SOLVE = "evercal.calibration.pose_pairs.shared.shared_errors"
 COLUMNS = ("arm", "errors", "deg", "poses", "mount", "target", "known")
 LEVELS = "evercal.calibration.pose_pairs.noise_levels."
 

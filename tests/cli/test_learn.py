@@ -20,7 +20,7 @@ from evercal.mapping.store import MapStore
 from evercal.recordings.samples import CELL
 
 KEYS = "scene seconds iterations memory_bytes head_bytes frames_kept landmarks train_frames"
-KEYS += " held_out_frames adjusted hand_eye warnings same_place set_aside"
+KEYS += " held_out_frames adjusted hand_eye fixed_share warnings same_place set_aside"
 ADJUSTED = "common_translation_mm common_rotation_deg focal_percent residual_px"
 
 

@@ -147,7 +147,9 @@ def test_wrong_input_is_one_line(run, folder: Path) -> None:
         name, *values = line.split(",")
         scaled.append(",".join([name, *(str(1000 * float(value)) for value in values)]))
     Path("touched.csv").write_text("\n".join(scaled))
-    assert "in the base frame in metres" in run.refused("verify tripod.json", TOUCHED)
+    assert "a coordinate is 587; points are in metres" in run.refused(
+        "verify tripod.json", TOUCHED
+    )
     assert read_calibration("tripod.json").verifications == ()
 
 

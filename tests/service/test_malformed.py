@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ import pytest
 
 from evercal.bounds import RequestBounds
 
-from .malformed import malformed
+from .malformed import PNG, malformed
 
 # The parser of forms leaves the last part of a truncated body to the garbage collector.
 pytestmark = pytest.mark.filterwarnings(
@@ -66,6 +67,23 @@ def test_malformed_requests(narrow, image):
 @pytest.mark.slow("src/evercal/service")
 def test_a_thousand_malformed_requests(narrow):
     print(statuses(narrow, range(100, 1100)))  # noqa: T201
+
+
+@pytest.mark.parametrize(
+    ("path", "part", "text"),
+    [
+        ("/localize", "camera", "a " + "9" * 60_000),
+        ("/localize", "camera", "image_width: 640\n" + "1 2\n" * 20_000),
+        ("/calibrations", "robot_poses", "pose:" + "\n" * 60_000),
+    ],
+)
+def test_work_is_proportional_to_the_text(
+    narrow: Any, path: str, part: str, text: str
+) -> None:
+    begin = time.perf_counter()
+    image = {"image" if part == "camera" else "images": ("a.png", PNG)}
+    narrow.post(path, **image, **{part: ("a.csv", text.encode())})
+    assert time.perf_counter() - begin < 3
 
 
 def test_clients_that_vanish(narrow, image):

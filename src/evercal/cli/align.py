@@ -1,7 +1,7 @@
 """`evercal align`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from evercal.classes import frozen
 from evercal.cli import args
@@ -40,7 +40,7 @@ class Align(args.Verb):
     """Touched points in the base frame: lines of name, x, y, z in metres."""
     picks: args.File = None
     """Points in images: lines of image, name, u, v in pixels; images relative to this file."""
-    distance: tuple[str, ...] = ()
+    distance: Annotated[tuple[str, ...], args.shown("A,B=METRES")] = ()
     """Metres between two picked points, such as A,B=0.297, in place of --points: the scene keeps
     its own frame."""
     base_frame: args.Frame = None

@@ -48,7 +48,7 @@ class Known:
 
 @frozen
 class Solve(args.Verb):
-    """Calibrate a camera from pairs of poses, or a fixed one by what is known in the base.
+    """Calibrate a camera by pairs of poses, or by places in the base.
 
     Both unknown transforms are estimated jointly, robust to outliers, with their uncertainty. A
     fixed camera needs no motions where it sees a board at a known place (--board-at), or points

@@ -7,7 +7,7 @@ accepted where that is below the rate of false accepts.
 """
 
 from functools import lru_cache
-from math import lgamma, log
+from math import lgamma, log, log10
 
 import numpy as np
 
@@ -28,6 +28,11 @@ APART_M = 0.01
 """Poses that differ by less, in metres and in radians, are the same answer."""
 APART_RAD = np.deg2rad(1.0)
 """See `APART_M`."""
+
+
+def required_support() -> float:
+    """Support of an accepted pose."""
+    return -log10(FALSE_ACCEPTS)
 
 
 @lru_cache(maxsize=64)

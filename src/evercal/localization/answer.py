@@ -14,22 +14,20 @@ from evercal.localization.other_bases import InBase
 from evercal.mapping.scene_map import SceneMap
 from evercal.typing import Array, Pair
 
-REQUIRED_SUPPORT = -math.log10(acceptance.FALSE_ACCEPTS)
-"""Support of an accepted pose."""
-
 
 def rejection(
     hypothesis: Hypothesis | None, scene: SceneMap, mirrored: float = 0.0
 ) -> str:
     """Why a pose is not accepted; `mirrored` is the support of the mirror image."""
-    if mirrored > REQUIRED_SUPPORT:
+    if mirrored > acceptance.required_support():
         return _mirrored_reason(hypothesis.support if hypothesis else 0.0, mirrored)
     if not hypothesis:
         return "fewer than 6 inliers"
+    required = acceptance.required_support()
     share = f"{100 * hypothesis.inlier_ratio:.0f} %"
     return (
         f"{hypothesis.inliers} inliers, {share} of the landmarks of {scene.name} that should be"
-        f" visible: support {hypothesis.support:.1f}, {REQUIRED_SUPPORT:.1f} is required"
+        f" visible: support {hypothesis.support:.1f}, {required:.1f} is required"
     )
 
 
@@ -177,7 +175,7 @@ def _useless(
     if isinstance(best, Aligned):
         camera = best.camera
         less = best.support - unlikely(camera, best.change)
-        if less < REQUIRED_SUPPORT:
+        if less < acceptance.required_support():
             return (
                 f"it needs a principal point at ({camera.cx:.0f}, {camera.cy:.0f}) of"
                 f" {camera.width}x{camera.height} px: give the whole image as the camera took it"

@@ -74,5 +74,5 @@ def test_tuning_split_uses_training_frames_only() -> None:
     test = [6, 7, 8, 21, 22, 23]
     assert [int(f.name) for f in scene.test] == test
     assert [int(f.name) for f in scene.train] == [i for i in range(30) if i not in test]
-    with pytest.raises(InputError, match=r"hall: 12 of 15 .* omit `held_out`"):
-        tuning_split(Recording("hall", train[:16], ()))
+    with pytest.raises(InputError, match=r"hall: 6 of 8 .* omit `held_out`"):
+        tuning_split(Recording("hall", train[:9], ()))

@@ -93,7 +93,7 @@ def test_bad_input_is_refused_and_leaves_the_store_unchanged(
         replace(f, base_from_camera=None, base_from_gripper=f.base_from_camera)
         for f in gamma.train
     ]
-    few = replace(gamma, train=gamma.train[:15])
+    few = replace(gamma, train=gamma.train[:7])
     for recording, change, message in (
         (replace(gamma, name="alpha"), {}, "'alpha'.*`name`"),
         (gamma, {"strategy": STRATEGIES["finetune"]}, r"'finetune'.*'sars_pixels'"),
@@ -103,12 +103,12 @@ def test_bad_input_is_refused_and_leaves_the_store_unchanged(
         (gamma, {"stage": options.stage.with_memory("auto")}, "memory auto"),
         (gamma, {"centres": 5}, "`centres` 5: .* made with 3"),
         (replace(gamma, train=tuple(gripper)), {}, "only gripper poses"),
-        (few, {}, "'gamma': 15 training frames"),
+        (few, {}, "'gamma': 7 training frames"),
     ):
         with pytest.raises(InputError, match=message):
             learn_networks(learned.root, recording, replace(options, **change))
     assert tree(learned.root) == before
-    with pytest.raises(InputError, match="15 training frames"):
+    with pytest.raises(InputError, match="7 training frames"):
         learn_networks(tmp_path / "new", few, options)
     assert not (tmp_path / "new").exists()
     (tmp_path / "thesis.tex").write_text("x")

@@ -29,8 +29,10 @@ def focus_warning(
     """
     ray = equation.viewing_rays(fit.at)
     distance = norms(ray)
-    direction = ray / distance[:, None]
     shift = fit.residual[:, :3]
+    if distance.min() <= np.median(norms(shift)):
+        return []
+    direction = ray / distance[:, None]
     along = (shift * direction).sum(1)
     across = norms(shift - along[:, None] * direction) / np.sqrt(2)
     known = equation.system(fit.at).known[:, :3, :3]

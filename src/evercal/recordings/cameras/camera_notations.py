@@ -27,8 +27,8 @@ _NEXT_PAIR = re.compile(r"[,;]\s*(?=[A-Za-z_][\w .]*[:=])")
 _NAMED_NUMBERS = re.compile(r"([A-Za-z_]\w*)((?:[\s,]+[-+.\d][-+.\deE]*)+)")
 _BRACKETS = str.maketrans("", "", "[](){}<>,;\"'")
 _REALSENSE = re.compile(
-    r"(?P<width>\d+)x(?P<height>\d+)\s+p\[(?P<cx>\S+) (?P<cy>\S+)\]\s+f\[(?P<fx>\S+) (?P<fy>\S+)"
-    r"\]\s+(?P<model>[A-Za-z ]+) \[(?P<coeffs>.*?)\]"
+    r"(?<!\d)(?P<width>\d+)x(?P<height>\d+)\s+p\[(?P<cx>\S+) (?P<cy>\S+)\]\s+"
+    r"f\[(?P<fx>\S+) (?P<fy>\S+)\]\s+(?P<model>[A-Za-z ]+) \[(?P<coeffs>.*?)\]"
 )
 """Intrinsics as pyrealsense2 prints them."""
 _COLMAP = re.compile(
@@ -122,8 +122,9 @@ def _of_lines(text: str) -> JsonObject:
             holder = section
             block = section[key] = {}
         else:
-            numbers = np.append(holder.get(key) or [], value_of(line))
-            holder[key] = numbers.tolist()
+            held = holder.get(key) or []
+            holder[key] = held if isinstance(held, list) else [held]
+            holder[key] += np.atleast_1d(value_of(line)).tolist()
     return data if any(data.values()) else {}
 
 

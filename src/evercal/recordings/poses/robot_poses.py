@@ -55,7 +55,7 @@ POSE_ENDINGS = (
     ".tf",
 )
 _YAML = re.compile(
-    r"(?:\s*#.*\n)*(?:%YAML|---\s*\n|(?:- )?[A-Za-z_]\w*:(?:\s*\n\s*(?:- )?[A-Za-z_]\w*:"
+    r"(?:\s*#.*\n)*(?:%YAML|---\s*\n|(?:- )?[A-Za-z_]\w*:(?:[^\S\n]*\n\s*(?:- )?[A-Za-z_]\w*:"
     r"| \{\s*[a-z]))"
 )
 """Beginning of YAML in a file with another ending."""
