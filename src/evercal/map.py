@@ -18,7 +18,7 @@ from evercal.errors import InputError
 from evercal.learning.learned_scenes import LearnedScenes
 from evercal.mapping.store import MapStore
 from evercal.recordings.frame import Recording
-from evercal.recordings.images import read_image
+from evercal.recordings.images import NamedPictures, read_image
 from evercal.robot.frame_names import UNKNOWN, FrameNames
 from evercal.robot.mount import MountName
 from evercal.typing import PathLike
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from evercal.calibration.image_source import ImageSource
     from evercal.evaluation import Scores
     from evercal.features.encoder import Features
-    from evercal.geometry import SE3, Camera
+    from evercal.geometry import SE3, Camera, UncertainPose
     from evercal.localization.estimate import PoseEstimate
     from evercal.localization.options import LocalizeOptions
     from evercal.localization.tracking import TrackedFrame, TrackOptions
@@ -195,6 +195,8 @@ class Map(LearnedScenes):
         points: Mapping[str, np.ndarray] | None = None,
         picks: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]] = (),
         distances: Mapping[tuple[str, str], float] | None = None,
+        board_poses: PathLike | None = None,
+        board_at: UncertainPose | None = None,
         unknown_scale: bool = False,
         base_frame: str | None = None,
     ) -> MapAlignment:
@@ -209,35 +211,33 @@ class Map(LearnedScenes):
             points: Instead of images: (3,) touched points by name in the base frame, metres.
             picks: Name, image (H, W, 3) and pixels (2,) by name of the point, of each image.
             distances: Instead of points: metres between picked points; the frame stays its own.
+            board_poses: File of `evercal detect` for images of a board that stands still.
+            board_at: base_from_board of it; by default, the board is the base.
             unknown_scale: Estimate the scale also where the recording was in metres.
             base_frame: Name of the base frame.
 
         Raises:
             InputError: No such scene, too few images or points, or another process writes a map.
         """
-        from evercal.calibration.from_map.align import align_by_gripper, align_by_points
+        from evercal.calibration.from_map.align import align_by_gripper
+        from evercal.calibration.from_map.by_board import align_by_board
+        from evercal.calibration.from_map.by_points import align_by_points
         from evercal.calibration.from_map.known_distance import by_distances
-        from evercal.calibration.image_source import Images
         from evercal.learning.mapped_already import placed
 
         with self._store.writing():
             own = self.localizer.contents.scene(scene)
             scale_known = own.unit is None and not unknown_scale
+            where = self.localizer, scene
             if distances:
-                found = by_distances(self.localizer, scene, distances, picks)
+                found = by_distances(*where, distances, picks)
+            elif board_poses is not None:
+                found = align_by_board(*where, board_poses, board_at, scale_known)
             elif points is not None:
-                found = align_by_points(
-                    self.localizer, scene, points, picks, scale_known
-                )
+                found = align_by_points(*where, points, picks, scale_known)
             else:
-                given = Images.of(images, None, robot_poses, convention)
-                if (poses := given.base_from_gripper) is None:
-                    raise InputError(
-                        "give images with robot_poses, or points with picks"
-                    )
-                found = align_by_gripper(
-                    self.localizer, scene, given.images, poses, scale_known, boards
-                )
+                given = _with_grippers(images, robot_poses, convention)
+                found = align_by_gripper(*where, *given, scale_known, boards)
             frames = replace(own.frames, base=base_frame or "")
             aligned = replace(found.applied_to(own), frames=frames, places={})
             others = self._store.contents.without(scene)
@@ -294,3 +294,16 @@ class Map(LearnedScenes):
         from evercal.evaluation import evaluate, scores
 
         return scores(evaluate(self.localizer, recordings))
+
+
+def _with_grippers(
+    images: ImageSource, robot_poses: PathLike | SE3 | None, convention: str | None
+) -> tuple[NamedPictures, SE3]:
+    from evercal.calibration.image_source import Images
+
+    given = Images.of(images, None, robot_poses, convention)
+    if given.base_from_gripper is None:
+        raise InputError(
+            "give images with robot_poses, points with picks, or board_poses"
+        )
+    return given.images, given.base_from_gripper

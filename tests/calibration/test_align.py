@@ -11,13 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from evercal.calibration.drift import check
 from evercal.calibration.from_images import calibrate
-from evercal.calibration.from_map.align import (
-    MapAlignment,
-    Picks,
-    align_by_gripper,
-    align_by_points,
-    fit_picks,
-)
+from evercal.calibration.from_map.align import MapAlignment, align_by_gripper
+from evercal.calibration.from_map.by_points import Picks, align_by_points, fit_picks
 from evercal.calibration.from_map.known_distance import by_distances
 from evercal.calibration.image_source import Images
 from evercal.errors import InputError

@@ -20,7 +20,7 @@ PACKAGES = {"serve": "fastapi", "view": "viser", "studio": "viser"}
 STRANGER = "holds networks of strategy finetune, and this needs a map"
 
 REFUSED = {
-    "align MAP hall": "either images with --robot-poses, or --points or --distance",
+    "align MAP hall": "either images with --robot-poses, --points or --distance",
     "align MAP hall --points p.csv": "--picks with either --points or --distance",
     "align NETWORKS box-room-41 image.png --robot-poses poses.csv": "holds networks of strategy",
     "audit MAP empty": "empty",

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 class Align(args.Verb):
     """Transform a scene in a frame of its own to the base frame.
 
-    Give images of a camera on the gripper with --robot-poses, or points that the tool has touched
-    with --points and --picks. The error of the alignment is part of every later answer.
+    Give images of a camera on the gripper with --robot-poses, points that the tool has touched with
+    --points and --picks, or --board-poses of a board that stands still. The error of the alignment
+    is part of every later answer.
 
     Example: evercal align cell.evercal cell wrist/ --robot-poses poses.csv
     """
@@ -34,8 +35,12 @@ class Align(args.Verb):
     convention: args.Name = None
     """Format of the robot poses, if the file does not state it."""
     board_poses: args.File = None
-    """Board poses from 'evercal detect', for a fixed camera that observes a board in the
-    gripper."""
+    """Board poses from 'evercal detect'. With --robot-poses, the gripper holds the board before a
+    fixed camera. Without them it stands still, and other images show it."""
+    board_at: Annotated[str | None, args.shown("FILE|X,Y,Z,QW,QX,QY,QZ")] = None
+    """base_from_board of a board that stands still; metres. Default: the board is the base."""
+    board_accuracy: Annotated[str, args.shown("MM,DEG")] = "1,0.2"
+    """Standard deviations of --board-at per axis."""
     points: args.File = None
     """Touched points in the base frame: lines of name, x, y, z in metres."""
     picks: args.File = None
@@ -51,22 +56,26 @@ class Align(args.Verb):
 
     def run(self) -> int:
         by_points = self.points is not None or self.picks is not None
-        if by_points == (self.robot_poses is not None):
+        by_board = self.board_poses is not None and self.robot_poses is None
+        if by_points + by_board + (self.robot_poses is not None) != 1:
             raise InputError(
-                "give either images with --robot-poses, or --points or --distance with --picks"
+                "give either images with --robot-poses, --points or --distance with --picks, or"
+                " --board-poses of a board that stands still"
             )
-        others = (*self.images, self.convention, self.board_poses)
-        if by_points and any(others):
+        if not self.robot_poses and (self.images or self.convention):
             raise InputError(
-                "--points: images, --convention and --board-poses belong to --robot-poses; omit"
-                " them"
+                "images and --convention belong to --robot-poses; omit them"
+            )
+        if self.board_at and not by_board:
+            raise InputError(
+                "--board-at: give --board-poses, too, and no --robot-poses"
             )
         from evercal.map import Map
         from evercal.mapping.store import MapStore
 
         cell = Map(MapStore.open(self.store))
         unit = cell.localizer.contents.scene(self.scene).unit or 1.0
-        given = self._by_points() if by_points else self._by_gripper()
+        given = self._given(by_board)
         alignment = cell.align(
             self.scene,
             **given,
@@ -75,6 +84,14 @@ class Align(args.Verb):
         )
         self._show(alignment, unit)
         return 0
+
+    def _given(self, by_board: bool) -> dict[str, Any]:
+        """What `Map.align` takes."""
+        if by_board:
+            return self._by_board()
+        if self.robot_poses:
+            return self._by_gripper()
+        return self._by_points()
 
     def _by_gripper(self) -> dict[str, Any]:
         """What `Map.align` takes of images with gripper poses."""
@@ -97,6 +114,16 @@ class Align(args.Verb):
             "convention": self.convention,
             "boards": boards,
         }
+
+    def _by_board(self) -> dict[str, Any]:
+        """What it takes of a board that stands still."""
+        from evercal.calibration.transform_file import read_place
+        from evercal.geometry import UncertainPose
+
+        place = None
+        if self.board_at:
+            place = UncertainPose(*read_place(self.board_at, self.board_accuracy))
+        return {"board_poses": self.board_poses, "board_at": place}
 
     def _by_points(self) -> dict[str, Any]:
         """What it takes of points."""

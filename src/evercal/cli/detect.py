@@ -14,7 +14,6 @@ from evercal.cli import args
 from evercal.cli.console import numbers, require_writable
 from evercal.errors import InputError
 from evercal.progress import progress_bar
-from evercal.typing import Size, Strings
 
 if TYPE_CHECKING:
     from evercal.calibration.boards.board import Board
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from evercal.calibration.boards.detection import Found, Image
     from evercal.calibration.boards.tag_layout import Arrangement
     from evercal.geometry import Camera
+    from evercal.typing import Size, Strings
 
 _DICTIONARIES: dict[BoardKind, str] = {
     "chessboard": "",
@@ -163,7 +163,7 @@ class Detect(args.Verb):
         )
 
     def _arrangement(
-        self, board: "Board", size: Size, camera: "Camera | None"
+        self, board: "Board", size: "Size", camera: "Camera | None"
     ) -> "Arrangement":
         from evercal.calibration.boards.tag_layout import Arrangement
 
@@ -211,7 +211,7 @@ class Detect(args.Verb):
             return find_boards(list(by_name), read, board, arrange)
 
 
-def _lines(poses: "BoardPoses", notes: Strings, warning: str) -> Iterator[str]:
+def _lines(poses: "BoardPoses", notes: "Strings", warning: str) -> Iterator[str]:
     for image in poses.images:
         if not image.camera_from_board:
             yield f"{image.name}: {image.reason}"

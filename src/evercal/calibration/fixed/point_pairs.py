@@ -10,7 +10,7 @@ from scipy.stats import chi2, f
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.checks import Checks
 from evercal.calibration.fixed.sightings import image_uses, judged
-from evercal.calibration.from_map.align import umeyama
+from evercal.calibration.from_map.by_points import umeyama
 from evercal.calibration.unseen.touched import DEPTH_M, DEPTH_SHARE, TOUCH_M
 from evercal.errors import InputError
 from evercal.geometry import SE3, cross_matrix, norms, unit_vectors

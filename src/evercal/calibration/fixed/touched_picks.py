@@ -10,7 +10,7 @@ from evercal.calibration.checks import Checks
 from evercal.calibration.fixed.corner_fit import corner_fit
 from evercal.calibration.fixed.sightings import image_uses, judged
 from evercal.calibration.fixed.still import still_pose
-from evercal.calibration.from_map.align import require_spread
+from evercal.calibration.from_map.by_points import require_spread
 from evercal.calibration.picked_points import PickedPoint
 from evercal.calibration.pose_pairs.pairs import BoardCorners
 from evercal.calibration.unseen.touched import require_usable

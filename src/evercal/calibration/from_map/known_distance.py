@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evercal.calibration.from_map.align import (
+from evercal.calibration.from_map.align import MapAlignment
+from evercal.calibration.from_map.by_points import (
     PICK_SIGMA_PX,
-    MapAlignment,
     Picks,
     located_picks,
     triangulated,
@@ -43,7 +43,7 @@ def by_distances(
     logarithms = []
     variances = []
     # Errors of poses by the intrinsics are common to all images.
-    by_poses = 2 * max(image.sigma_m for image in images) ** 2
+    by_poses = 2 * max(np.trace(image.covariance[:3, :3]) / 3 for image in images)
     for (first, second), metres in distances.items():
         for name in (first, second):
             if name not in places:

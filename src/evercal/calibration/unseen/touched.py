@@ -6,7 +6,7 @@ import numpy as np
 
 from evercal.calibration.evidence import Data, gripper_sigma
 from evercal.calibration.framed_pose import FramedPose
-from evercal.calibration.from_map.align import PICK_SIGMA_PX
+from evercal.calibration.from_map.by_points import PICK_SIGMA_PX
 from evercal.calibration.picked_points import PickedPoint
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
