@@ -107,6 +107,14 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     np.testing.assert_allclose(changed.values(values), expected)
 
 
+@pytest.mark.parametrize("unit", [0.002, 0.0005])
+@pytest.mark.parametrize("turns", [True, False])
+def test_any_unit_is_written(tmp_path: Path, unit: float, turns: bool) -> None:
+    stated = JointMap.of_columns(["p"], ["x"], np.array([unit]))
+    again = JointMap.read(write(tmp_path, stated.record([turns])))
+    np.testing.assert_allclose(again.values(np.ones((1, 1))), unit, rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("entries", "message"),
     [

@@ -4,6 +4,8 @@ Each joint stands at unit * (factor * column + ...) + offset.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -46,53 +48,25 @@ class JointMap:
         cls, joints: Sequence[str], columns: Sequence[str], units: Array
     ) -> Self:
         """Each joint is one column, in units (k,)."""
-        return cls(
-            (*joints,),
-            (*columns,),
-            np.diag(units),
-            np.zeros(len(units)),
-        )
+        offsets = np.zeros(len(units))
+        return cls((*joints,), (*columns,), np.diag(units), offsets)
 
     @classmethod
     def read(cls, path: Path) -> Self:
         """Read a file of `record`."""
-        data = read_json(
-            path,
-            "joint map",
-            f"give {_FORM}",
-        )
-        with named_errors(
-            path,
-            "joint map",
-        ):
+        data = read_json(path, "joint map", f"give {_FORM}")
+        with named_errors(path, "joint map"):
             entries = data.get("joints")
-            if (
-                not isinstance(
-                    entries,
-                    dict,
-                )
-                or not entries
-            ):
+            if not isinstance(entries, dict) or not entries:
                 raise ValueError(f"no joint map; give {_FORM}")
-            rows = [
-                _row(
-                    joint,
-                    entry,
-                )
-                for joint, entry in entries.items()
-            ]
-        columns = tuple({column: 0 for row, _ in rows for column in row})
+            rows = [_row(joint, entry) for joint, entry in entries.items()]
+        columns = [*dict.fromkeys(column for row, _ in rows for column in row)]
         matrix = np.zeros((len(rows), len(columns)))
         for i, (row, _) in enumerate(rows):
             for column, factor in row.items():
                 matrix[i, columns.index(column)] = factor
         offsets = np.array([offset for _, offset in rows])
-        return cls(
-            (*entries,),
-            columns,
-            matrix,
-            offsets,
-        )
+        return cls((*entries,), (*columns,), matrix, offsets)
 
     def values(self, values: Array) -> Array:
         """(n, k) values of the joints, from columns (n, m)."""
@@ -107,21 +81,9 @@ class JointMap:
                 f" are {', '.join(others.columns)}"
             )
         matrix = np.zeros((len(self.joints), len(others.columns)))
-        matrix[
-            :,
-            [
-                *map(
-                    others.columns.index,
-                    self.columns,
-                )
-            ],
-        ] = self.matrix
+        matrix[:, [*map(others.columns.index, self.columns)]] = self.matrix
         rest = []
-        for joint, column in zip(
-            others.joints,
-            others.columns,
-            strict=True,
-        ):
+        for joint, column in zip(others.joints, others.columns, strict=True):
             if joint not in self.joints and column not in self.columns:
                 rest.append(joint)
         kept = others.of(rest)
@@ -134,91 +96,53 @@ class JointMap:
 
     def of(self, joints: Sequence[str]) -> Self:
         """The part of some joints, in their order."""
-        rows = [
-            *map(
-                self.joints.index,
-                joints,
-            )
-        ]
-        matrix = self.matrix[rows]
-        return type(self)(
-            (*joints,),
-            self.columns,
-            matrix,
-            self.offsets[rows],
+        rows = [*map(self.joints.index, joints)]
+        return replace(
+            self,
+            joints=(*joints,),
+            matrix=self.matrix[rows],
+            offsets=self.offsets[rows],
         )
 
     def after(self, matrix: Array, offsets: Array) -> Self:
         """Joints that stand at matrix (k, k) @ what this map gives + offsets (k,)."""
         both = matrix @ self.offsets + offsets
-        return type(self)(
-            self.joints,
-            self.columns,
-            matrix @ self.matrix,
-            both,
-        )
+        return replace(self, matrix=matrix @ self.matrix, offsets=both)
 
     def record(self, rotates: Sequence[bool]) -> JsonObject:
         """The map as JSON."""
         entries = {}
-        for i, joint in enumerate(self.joints):
-            row = self.matrix[i]
-            size = float(np.abs(row).max())
-            factors = {
-                self.columns[j]: round(
-                    row[j] / size,
-                    6,
-                )
-                for j in row.nonzero()[0]
-            }
-            entry: JsonObject = {"columns": factors}
-            names = ("rad", "deg", "steps") if rotates[i] else ("m", "mm")
-            exact = [name for name in names if abs(size / UNITS[name] - 1) < 1e-6]
-            offset = float(self.offsets[i])
-            if rotates[i]:
-                entry["unit"] = next(
-                    iter(exact),
-                    np.rad2deg(size),
-                )
-                entry["offset_deg"] = round(
-                    (np.rad2deg(offset) + 180) % 360 - 180,
-                    3,
-                )
-            else:
-                entry["unit"] = next(
-                    iter(exact),
-                    size,
-                )
-                entry["offset_m"] = offset
+        rows = zip(self.joints, rotates, self.matrix, self.offsets, strict=True)
+        for joint, turns, row, offset in rows:
+            size = np.abs(row).max()
+            entry: JsonObject = {"offset_m": offset}
+            units = ["m", "mm"]
+            if turns:
+                degrees = (np.rad2deg(offset) + 180) % 360 - 180
+                entry = {"offset_deg": round(degrees, 3)}
+                units = ["rad", "deg", "steps", np.rad2deg(size)]
+            exact = [unit for unit in units if np.isclose(_size(unit), size, 1e-6, 0)]
+            (entry["unit"], *_) = *exact, "m"
+            factors = np.round(row / _size(entry["unit"]), 9).tolist()
+            named = zip(self.columns, factors, strict=True)
+            entry["columns"] = {column: factor for column, factor in named if factor}
             entries[joint] = entry
         return {"joints": entries}
 
 
+def _size(unit: Any) -> float:
+    """Radians or metres of a unit, which is a name or a number of degrees."""
+    return UNITS.get(unit) or np.deg2rad(float(unit))
+
+
 def _row(joint: str, entry: Any) -> tuple[dict[str, float], float]:
     """Factors of the columns of a joint, and its offset."""
-    try:
-        unit = entry["unit"]
-        size = (
-            UNITS[unit]
-            if isinstance(
-                unit,
-                str,
-            )
-            else np.deg2rad(float(unit))
-        )
+    with suppress(KeyError, TypeError, ValueError, AttributeError):
+        size = _size(entry["unit"])
         row = {c: size * float(factor) for c, factor in entry["columns"].items()}
-        offset = np.deg2rad(
-            entry.get(
-                "offset_deg",
-                0,
-            )
-        ) + entry.get(
-            "offset_m",
-            0,
-        )
+        degrees = entry.get("offset_deg", 0)
+        offset = np.deg2rad(degrees) + entry.get("offset_m", 0)
         known = entry.keys() <= {"columns", "unit", "offset_deg", "offset_m"}
         if known and row and np.isfinite([*row.values(), offset]).all():
-            return row, float(offset)
-    except (KeyError, TypeError, ValueError, AttributeError):
-        pass
+            return row, offset
     raise ValueError(f"joint {joint} is {entry}; give {_FORM}")
