@@ -52,11 +52,10 @@ _LEAST = 0.3
 """Largest angle of an arm, at least, radians."""
 _SPAN = 100.0
 """Normalised values are between minus and plus this."""
-_WORDS = {
-    "deg": "in degrees",
-    "steps": "in steps of the motor, 4096 a turn",
-    "": "normalised, neither radians nor degrees",
-}
+_STEPS = "in steps of the motor, 4096 a turn"
+_NORMALISED = "normalised, neither radians nor degrees"
+_UNITS = {"": 1.0, "in degrees": UNITS["deg"], _STEPS: UNITS["steps"]}
+"""Factors to radians by words; others are those of normalised values."""
 
 
 class Explained(NamedTuple):
@@ -102,14 +101,14 @@ def joint_search(test: JointTest) -> JointVerdict:
     found: list[Explained] = []
     for most in range(1, _ROUNDS + 2):
         tried, readings = _best(test, tried)
-        simple = False
         for reading in readings:
             one = _judged(test, reading)
             if one.cost < limit and one.error_deg < _FOUND_DEG:
                 found.append(one)
-                explains = one.direction_deg < _DIRECTION_DEG
-                simple |= explains and len(one.mistakes) <= most
-        if simple:
+        least = [
+            len(one.mistakes) for one in found if one.direction_deg < _DIRECTION_DEG
+        ]
+        if min(least, default=most + 1) <= most:
             break
         tried = _composed(tried, changes)
     return JointVerdict(stated, _simplest(found))
@@ -208,31 +207,27 @@ def _bases(test: JointTest) -> Array:
     """Readings in which all values have a unit that makes them angles, or are normalised."""
     same = _same(test.arm)
     turns = test.arm.rotates()
+    free = turns & test.arm.free()
     sizes = np.abs(test.values).max(0) * turns
-    degrees = np.full(len(same), UNITS["deg"])
+    lower, middle, upper = np.broadcast_to(test.arm.ranges, (len(same), 3)).T
+    normal = np.minimum((upper - lower) / 2, _TURN / 2) / _SPAN
+    degrees = UNITS["deg"]
     bases = [same]
-    for scale in (
-        degrees,
-        np.where(sizes > _TURN, degrees, 1.0),
-        np.full(len(same), UNITS["steps"]),
-        1 / degrees,
+    for scale, zero, freedom in (
+        (degrees, 0.0, 0.0),
+        (np.where(sizes > _TURN, degrees, 1.0), 0.0, 0.0),
+        # The zero of a motor is in the middle of its steps.
+        (UNITS["steps"], -_TURN / 2, 0.0),
+        (1 / degrees, 0.0, 0.0),
+        (normal, middle * free, _RANGES),
     ):
         if _LEAST < (sizes * scale).max() < 2 * _TURN:
             base = same.copy()
-            base[turns, :OFFSET] *= scale[turns, None]
-            # The zero of a motor is in the middle of its steps.
-            base[scale == UNITS["steps"], OFFSET] = -_TURN / 2
+            base[:, :OFFSET] *= np.where(turns, scale, 1.0)[:, None]
+            base[:, OFFSET] = zero * turns
+            base[:, FREEDOM] = freedom * turns
+            base[free & (freedom > 0), SPREAD] = _ANY
             bases.append(base)
-    if _SPAN / 4 < sizes.max() < 1.2 * _SPAN:
-        lower, middle, upper = np.broadcast_to(test.arm.ranges, (len(same), 3)).T
-        base = same.copy()
-        half = np.minimum((upper - lower) / 2, _TURN / 2) / _SPAN
-        base[turns, :OFFSET] *= half[turns, None]
-        free = turns & test.arm.free()
-        base[free, OFFSET] = middle[free]
-        base[free, SPREAD] = _ANY
-        base[turns, FREEDOM] = _RANGES
-        bases.append(base)
     return np.array(bases)
 
 
@@ -246,18 +241,19 @@ def described(arm: Arm, reading: Array) -> Strings:
     found = []
     if moved.size:
         found.append(f"the columns of joints {_names(arm, moved)} are in another order")
-    units = np.array([unit_of(factor) for factor in sizes.max(1)])
-    normalised = "" in units
+    factors = sizes.max(1)
+    known = [np.isclose(factors, unit, 0.01, 0.0) for unit in _UNITS.values()]
+    units = np.select(known, [*_UNITS], _NORMALISED)
+    normalised = _NORMALISED in units
     if normalised:
-        units[:] = ""
-    for unit, words in _WORDS.items():
-        joints = np.flatnonzero(units == unit)
+        units[:] = _NORMALISED
+    for words in dict.fromkeys(units[units != ""].tolist()):
+        joints = np.flatnonzero(units == words)
         whose = "values are"
         if joints.size < len(units):
             whose = f"values of joints {_names(arm, joints)} are"
-        if joints.size:
-            found.append(f"{whose} {words}")
-    zeros = reading[:, OFFSET] + _TURN / 2 * ("steps" in units)
+        found.append(f"{whose} {words}")
+    zeros = reading[:, OFFSET] + _TURN / 2 * (units == _STEPS)
     far = np.rad2deg(np.abs((zeros + np.pi) % _TURN - np.pi))
     for i, joint in enumerate(arm.joints):
         main = matrix[i, columns[i]]
@@ -278,11 +274,3 @@ def described(arm: Arm, reading: Array) -> Strings:
 
 def _names(arm: Arm, joints: IntArray) -> str:
     return ", ".join(arm.joints[i] for i in joints)
-
-
-def unit_of(factor: float) -> str:
-    """The unit of a factor to radians; empty if it is none."""
-    for unit in ("rad", "deg", "steps"):
-        if abs(np.log(factor / UNITS[unit])) < 0.01:
-            return unit
-    return ""
