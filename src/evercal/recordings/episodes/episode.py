@@ -10,7 +10,7 @@ from evercal.errors import InputError
 from evercal.geometry import Camera
 from evercal.recordings.frame import Frame
 from evercal.recordings.images import StoredImage
-from evercal.recordings.poses.joint_tables import in_radians
+from evercal.recordings.poses.joint_tables import radians_per
 from evercal.robot.robot_model import RobotModel
 from evercal.typing import Array, Floats, Strings
 
@@ -61,8 +61,8 @@ def values_of_joints(
             f"{model.path}: has {len(joints)} joints that move, the data set states {len(kept)};"
             f" give `urdf` of the robot"
         )
-    values = in_radians(model, joints, values[:, kept], [unit] * len(kept))
-    return tuple(joints), values
+    factors = radians_per(model, joints, [unit] * len(kept))
+    return tuple(joints), values[:, kept] * factors
 
 
 def frames_of(

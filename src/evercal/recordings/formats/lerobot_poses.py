@@ -16,7 +16,6 @@ from evercal.recordings.poses.conventions import (
 from evercal.recordings.poses.joint_tables import (
     arm_poses,
     joint_reading,
-    poses_of_arm,
 )
 from evercal.recordings.poses.pose_units import checked_poses
 from evercal.recordings.poses.robot_poses import RobotPoses
@@ -120,8 +119,7 @@ def _joint_poses(
         refuse_repeated(names, "rename the numbers")
     model = RobotModel(options.urdf, options.whole_robot, options.unchecked_joints)
     read = joint_reading(model, names, source, options)
-    moved = arm_poses(model, read, values, source, options)
-    return poses_of_arm(moved), moved.notes
+    return arm_poses(model, read, values, source, options)
 
 
 def _pose_columns(names: list[str], arm: str | None) -> tuple[str, list[int]]:

@@ -20,9 +20,9 @@ from evercal.recordings.poses.row_files import (
     row_labels,
 )
 from evercal.recordings.read_options import ReadOptions
-from evercal.robot.joint_map import JointMap
+from evercal.robot.joint_map import UNITS, JointMap
 from evercal.robot.joint_names import joints_by_column
-from evercal.robot.robot_model import ArmPoses, RobotModel
+from evercal.robot.robot_model import RobotModel
 from evercal.storage.text_files import (
     library_errors,
     named_errors,
@@ -47,13 +47,8 @@ def read_joint_poses(
     options = options or ReadOptions()
     rows = read_joints(path)
     read = joint_reading(model, rows.columns, path, options)
-    links = model.chosen_links(options.base_frame, options.gripper_frame)
-    if not model.read_arm(*links, read.joints, path).joints:
-        raise InputError(
-            f"{model.path}: no joint moves {links[1]} against {links[0]}; name other links"
-        )
-    moved = arm_poses(model, read, rows.values, path, options)
-    return poses_of_arm(moved, rows), moved.notes
+    poses, notes = arm_poses(model, read, rows.values, path, options)
+    return replace(poses, names=rows.names, stamps_s=rows.stamps_s), notes
 
 
 def joint_reading(
@@ -84,8 +79,7 @@ def joint_reading(
     named = [found.get(name, name) for name in names]
     with named_errors(str(source), "joint angles"):
         refuse_repeated(filter(model.has_joint, named), "keep one column of each joint")
-    sizes = in_radians(model, named, np.ones((1, len(named))), units)[0]
-    read = JointMap.of_columns(named, columns, sizes)
+    read = JointMap.of_columns(named, columns, radians_per(model, named, units))
     if options.joint_map:
         read = JointMap.read(options.joint_map).with_others(read, source)
     return read
@@ -97,45 +91,43 @@ def arm_poses(
     values: Array,
     source: PathLike,
     options: ReadOptions,
-) -> ArmPoses:
-    """Poses of an arm, from columns (n, m)."""
-    links = options.base_frame, options.gripper_frame
+) -> tuple[RobotPoses, list[str]]:
+    """Poses of an arm from columns (n, m), with notes."""
+    links = model.chosen_links(options.base_frame, options.gripper_frame)
     moved = model.poses(read.joints, read.values(values), *links, source)
+    if not moved.arm.joints:
+        raise InputError(
+            f"{model.path}: no joint moves {links[1]} against {links[0]}; name other links"
+        )
     own = read.of(moved.arm.joints)
     renamed = []
-    for i, joint in enumerate(own.joints):
-        columns = [own.columns[j] for j in np.flatnonzero(own.matrix[i])]
+    for joint, row in zip(own.joints, own.matrix, strict=True):
+        columns = [own.columns[i] for i in np.flatnonzero(row)]
         if joint not in columns and f"{joint}_deg" not in columns:
             renamed.append(f"{joint} from {' and '.join(columns)}")
     if renamed:
         moved.notes.append(f"values of joints by other names: {', '.join(renamed)}")
-    return moved._replace(arm=replace(moved.arm, read=own))
-
-
-def poses_of_arm(moved: ArmPoses, rows: LabelledRows | None = None) -> RobotPoses:
-    """Poses of an arm with their joint values, and with the names and times of rows."""
-    names = rows and rows.names
-    stamps_s = rows and rows.stamps_s
-    return RobotPoses(
-        names,
-        stamps_s,
+    poses = RobotPoses(
+        None,
+        None,
         moved.poses,
-        arm=moved.arm,
+        arm=replace(moved.arm, read=own),
         joints=moved.joints,
         frames=moved.frames,
     )
+    return poses, moved.notes
 
 
-def in_radians(
-    model: RobotModel, names: Sequence[str], values: Array, units: Sequence[str | None]
+def radians_per(
+    model: RobotModel, names: Sequence[str], units: Sequence[str | None]
 ) -> Array:
-    """Convert angles in degrees to radians and leave other values (n, k) as they are."""
+    """(k,) factors of values of joints: to radians where angles are in degrees, else 1."""
     in_degrees = []
     for name, unit in zip(names, units, strict=True):
         if unit not in (None, *_UNITS):
             raise InputError(f"`pose_convention` {unit}: joint angles are rad or deg")
         in_degrees.append(unit == "deg" and model.rotates(name))
-    return np.where(in_degrees, np.deg2rad(values), values)
+    return np.where(in_degrees, UNITS["deg"], 1.0)
 
 
 def interpolate(

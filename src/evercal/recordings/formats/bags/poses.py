@@ -20,7 +20,6 @@ from evercal.recordings.poses.joint_tables import (
     arm_poses,
     interpolate,
     joint_reading,
-    poses_of_arm,
 )
 from evercal.recordings.poses.robot_poses import RobotPoses
 from evercal.recordings.read_options import ReadOptions
@@ -133,10 +132,10 @@ def _from_joints(
         times, positions = np.array(track[topic]).T
         values[:, column], is_valid = interpolate(times, positions, stamps)
         valid &= is_valid
-    moved = arm_poses(model, read, values, bag.path, options)
+    poses, notes = arm_poses(model, read, values, bag.path, options)
     if not valid.any():
         _refuse_times(bag, stamps, times, "the joint states")
-    return ImagePoses(poses_of_arm(moved), valid, "gripper", moved.notes)
+    return ImagePoses(poses, valid, "gripper", notes)
 
 
 def _joint_tracks(
