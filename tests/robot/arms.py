@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3, norms
 from evercal.robot.arm import Arm, MovingJoint
-from evercal.robot.joint_agreement import PairMotions, chords
+from evercal.robot.joint_agreement import PairMotions
 from evercal.robot.mount import EYE_IN_HAND, Mount
 from evercal.simulation.panda_arm import HIGH_RAD, LINKS, LOW_RAD
 from evercal.typing import Array
@@ -110,9 +110,9 @@ def motions(
     cameras = mount.scene_from_parent(arm.poses(values)) @ carried
     pairs = np.stack(np.triu_indices(len(values), 1), 1)
     between = cameras[pairs[:, 0]].inverse() @ cameras[pairs[:, 1]]
-    chosen = rng.permutation(np.argsort(norms(chords(between)))[:90])[:36]
+    chosen = rng.permutation(np.argsort(norms(between.rotation.as_rotvec()))[:90])[:36]
     noise = np.pad(rng.normal(0, np.deg2rad(0.7), (36, 3)), ((0, 0), (3, 0)))
-    turns = chords(between[chosen] @ SE3.exp(noise))
+    turns = (between[chosen] @ SE3.exp(noise)).rotation.as_rotvec()
     directions = between[chosen].translation_m
     directions /= norms(directions)[:, None] + 1e-9
     directions += rng.normal(0, 0.05, directions.shape)

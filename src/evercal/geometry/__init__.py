@@ -7,6 +7,7 @@ from evercal.geometry.se3 import (
     cross_matrix as cross_matrix,
     deviations as deviations,
     length_mm_deg as length_mm_deg,
+    nearest_rotation as nearest_rotation,
     norms as norms,
     pose_distance as pose_distance,
     pose_distance_mm_deg as pose_distance_mm_deg,

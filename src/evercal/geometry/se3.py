@@ -337,6 +337,13 @@ def rotation_error(blocks: Array) -> Array:
     return np.abs(gram - np.eye(3))
 
 
+def nearest_rotation(blocks: Array) -> Array:
+    """(..., 3, 3) rotations nearest to any matrices (..., 3, 3)."""
+    left, _, right = np.linalg.svd(blocks)
+    left[..., -1] *= np.linalg.det(left @ right)[..., None]
+    return left @ right
+
+
 def _quaternion(matrix: Array) -> Array:
     """(..., 4) of the rotations nearest to matrices (..., 3, 3) (Bar-Itzhack, JGCD 2000)."""
     (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(matrix, (-2, -1), (0, 1))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evercal.geometry import SE3, cross_matrix, norms
+from evercal.geometry import SE3, cross_matrix, nearest_rotation, norms
 from evercal.robot.arm import Arm
 from evercal.robot.mount import Mount
 from evercal.typing import Array, IntArray
@@ -24,7 +24,7 @@ _AT_ONCE = 400
 """Readings that are compared at once."""
 _ANGLE = 0.15
 """Difference of angles at which a pair loses half its weight, radians."""
-_ALIGNMENTS = 3
+_ALIGNMENTS = 4
 """Number of weighted alignments of rotations."""
 _PARALLEL = 0.02
 """Ratio of turns about the second axis to those about the main one, below which all are alike."""
@@ -50,7 +50,7 @@ class PairMotions(NamedTuple):
     ends: IntArray
     """(p, 2) numbers of the images."""
     turns: Array
-    """(p, 3) `chords` of first_from_second."""
+    """(p, 3) rotation vectors of first_from_second."""
     directions: Array
     """(p, 3) unit vectors from the first camera to the second one, in the first."""
 
@@ -62,25 +62,15 @@ class JointTest:
     """
 
     def __init__(self, arm: Arm, values: Array, motions: PairMotions, mount: Mount):
-        used, ends = np.unique(
-            motions.ends,
-            return_inverse=True,
-        )
+        used, ends = np.unique(motions.ends, return_inverse=True)
         self.arm = arm
         self.values = values[used]
-        self.ends = ends.reshape(motions.ends.shape)
+        self.ends = ends
         self.motions = motions
         self.mount = mount
-        stated = self._between(
-            np.eye(
-                values.shape[1],
-                values.shape[1] + 3,
-            )[None]
-        )
-        sizes = np.linalg.svd(
-            chords(stated)[0],
-            compute_uv=False,
-        )
+        count = values.shape[1]
+        stated = self._between(np.eye(count, count + 3)[None])
+        sizes = np.linalg.svd(stated.rotation.as_rotvec()[0], compute_uv=False)
         # Turns about one axis leave the camera's rotation about it open.
         parallel = sizes[1] < _PARALLEL * sizes[0]
         self.of_directions = 0.0 if parallel else _OF_DIRECTIONS
@@ -88,55 +78,30 @@ class JointTest:
     def residuals(self, readings: Array) -> Array:
         """(h, 2, p, 3) differences of rotations and of directions, of h readings."""
         between = self._between(readings)
-        stated = chords(between)
+        stated = between.rotation.as_rotvec()
         turns = self.motions.turns
-        unlike = norms(stated) - norms(turns)
         rotation = np.eye(3)
-        turned = stated
+        turned = np.zeros_like(stated)
         for _ in range(_ALIGNMENTS):
-            weighted = stated / (1 + (unlike / _ANGLE) ** 2)[..., None]
-            left, _, right = np.linalg.svd(
-                weighted.swapaxes(
-                    1,
-                    2,
-                )
-                @ turns
-            )
-            left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
-            rotation = left @ right
+            weights = 1 / (1 + (norms(turned) / _ANGLE) ** 2)
+            sides = stated.swapaxes(1, 2) * weights[:, None]
+            rotation = nearest_rotation(sides @ turns)
             turned = stated @ rotation - turns
-            unlike = norms(turned)
-        directions = self.motions.directions @ rotation.swapaxes(
-            1,
-            2,
-        )
-        moved = self._moved(
-            between,
-            directions,
-        )
+        directions = self.motions.directions @ rotation.swapaxes(1, 2)
+        moved = self._moved(between, directions)
         unit = moved / (norms(moved)[..., None] + _SHORT_M)
         aside = unit - directions * norms(unit)[..., None]
-        return np.stack(
-            [turned, self.of_directions * aside],
-            1,
-        )
+        return np.stack([turned, self.of_directions * aside], 1)
 
     def _between(self, readings: Array) -> SE3:
         """(h, p) motions of what carries the camera."""
         frames, count = self.values.shape
-        joints = self.values @ readings[:, :, :count].swapaxes(
-            1,
-            2,
-        )
+        joints = self.values @ readings[:, :, :count].swapaxes(1, 2)
         joints += readings[:, None, :, OFFSET]
-        poses = self.arm.poses(
-            joints.reshape(
-                -1,
-                count,
-            )
-        )
+        poses = self.arm.poses(joints.reshape(-1, count))
         poses = self.mount.scene_from_parent(poses)
-        rows = frames * np.arange(len(readings))[:, None, None] + self.ends
+        firsts = frames * np.arange(len(readings))
+        rows = firsts[:, None, None] + self.ends
         return poses[rows[..., 0]].inverse() @ poses[rows[..., 1]]
 
     def _moved(self, between: SE3, directions: Array) -> Array:
@@ -152,18 +117,10 @@ class JointTest:
             off = norms((aside + slopes @ position)[..., 0])
             length = norms(moved + (lever @ position)[..., 0]) + _SHORT_M
             weights = 1 / (length**2 + (off / _ANGLE) ** 2)
-            sides = (
-                slopes.swapaxes(
-                    2,
-                    3,
-                )
-                * weights[..., None, None]
-            )
+            sides = slopes.swapaxes(2, 3) * weights[..., None, None]
             squares = (sides @ slopes).sum(1) + prior * np.eye(3)
-            position = -np.linalg.solve(
-                squares,
-                (sides @ aside).sum(1),
-            )[:, None]
+            fitted = np.linalg.solve(squares, (sides @ aside).sum(1))
+            position = -fitted[:, None]
         return moved + (lever @ position)[..., 0]
 
     def saturated(self, readings: Array, cap: float) -> Array:
@@ -223,9 +180,3 @@ class JointTest:
             least[better] = after[better]
             damping *= np.where(better, 0.25, 8.0)[:, None, None]
         return moved(best)
-
-
-def chords(rotations: SE3) -> Array:
-    """(..., 3) axis times twice the sine of half the angle, at most half a turn."""
-    wxyz = rotations.rotation_wxyz
-    return 2 * wxyz[..., 1:] * np.where(wxyz[..., :1] < 0, -1, 1)

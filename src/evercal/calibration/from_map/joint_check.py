@@ -7,10 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from evercal.calibration.from_map.image_pairs import ImagePair, image_pairs
 from evercal.features.encoder import load_encoder
-from evercal.geometry import SE3, spread
+from evercal.geometry import spread
 from evercal.recordings.frame import MIN_TRAIN_FRAMES, Recording
 from evercal.robot.arm import Arm
-from evercal.robot.joint_agreement import JointTest, PairMotions, chords
+from evercal.robot.joint_agreement import JointTest, PairMotions
 from evercal.robot.joint_search import JointVerdict, joint_search
 from evercal.robot.mount import Mount
 from evercal.typing import Array
@@ -56,9 +56,8 @@ def pair_motions(pairs: Sequence[ImagePair]) -> PairMotions:
             )
         rotations.append(turn.T)
         directions.append(-(turn.T @ shift)[:, 0])
-    wxyz = Rotation.from_matrix(rotations).as_quat(scalar_first=True)
     ends = np.array([pair[:2] for pair in pairs], np.int64)
-    turns = chords(SE3(wxyz, np.zeros((len(pairs), 3))))
+    turns = Rotation.from_matrix(rotations).as_rotvec()
     return PairMotions(ends, turns, np.array(directions))
 
 

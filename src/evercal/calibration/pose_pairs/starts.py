@@ -14,7 +14,7 @@ import numpy as np
 from evercal.calibration.pose_pairs.fit import Agreement, agreement
 from evercal.calibration.pose_pairs.pairs import PosePairs
 from evercal.calibration.pose_pairs.pose_equation import Extras, PoseEquation, Unknowns
-from evercal.geometry import spread
+from evercal.geometry import nearest_rotation, spread
 from evercal.robot.mount import MountName
 from evercal.typing import Array, IntArray
 
@@ -116,7 +116,7 @@ def _solve_motions(
     translation_b = board[first] - (rotation_b @ board[second][..., None])[..., 0]
     axes_a = _sine_axes(rotation_a)
     axes_b = _sine_axes(rotation_b)
-    rotations = _nearest(axes_a.transpose(0, 2, 1) @ axes_b)
+    rotations = nearest_rotation(axes_a.transpose(0, 2, 1) @ axes_b)
     system = rotation_a - np.eye(3)
     right_side = -translation_a
     rotated = translation_b @ rotations.transpose(0, 2, 1)
@@ -164,7 +164,7 @@ def _spread(
     h, n = translations.shape[:2]
     half = min(n, (n + 4) // 2)
     rows = np.arange(h)[:, None]
-    mean_rotation = _nearest(np.median(rotations, 1))
+    mean_rotation = nearest_rotation(np.median(rotations, 1))
     mean_translation = np.median(translations, 1)
     spread = np.zeros(h)
     for _ in range(_REFINEMENTS):
@@ -176,14 +176,8 @@ def _spread(
         ratio = metres2 / np.median(metres2, 1, keepdims=True)
         ratio += radians2 / np.median(radians2, 1, keepdims=True)
         nearest = np.argsort(ratio, 1)[:, :half]
-        mean_rotation = _nearest(rotations[rows, nearest].mean(1))
+        mean_rotation = nearest_rotation(rotations[rows, nearest].mean(1))
         mean_translation = translations[rows, nearest].mean(1)
         spread = np.log(metres2[rows, nearest].mean(1))
         spread += np.log(radians2[rows, nearest].mean(1))
     return spread, mean_rotation, mean_translation
-
-
-def _nearest(matrices: Array) -> Array:
-    left, _, right = np.linalg.svd(matrices)
-    left[..., -1] *= np.linalg.det(left @ right)[..., None]
-    return left @ right
