@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3, norms
+from evercal.geometry.motions import PairMotions
 from evercal.robot.arm import Arm, MovingJoint
-from evercal.robot.joint_agreement import PairMotions
 from evercal.robot.mount import EYE_IN_HAND, Mount
 from evercal.simulation.panda_arm import HIGH_RAD, LINKS, LOW_RAD
 from evercal.typing import Array

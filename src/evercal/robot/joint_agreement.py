@@ -1,18 +1,15 @@
 """`JointTest`: readings of joint values, compared with the motions between images.
 
-A reading is q = matrix @ values + offset. The rotation of a camera between two images equals that
-of the gripper up to one fixed rotation, and its translation does up to one fixed position. Both
-have a closed form for each reading, so thousands of readings are compared in a second.
+A reading is q = matrix @ values + offset. Thousands of readings are compared in a second.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 
-from evercal.geometry import SE3, cross_matrix, nearest_rotation, norms
+from evercal.geometry import SE3, norms
+from evercal.geometry.motions import PairMotions
 from evercal.robot.arm import Arm
 from evercal.robot.mount import Mount
-from evercal.typing import Array, IntArray
+from evercal.typing import Array
 
 OFFSET = -3
 """Column of a reading: offset of a joint, radians, or metres of sliding joints."""
@@ -22,14 +19,8 @@ FREEDOM = -1
 """Column of the standard deviation of the logarithm of a factor."""
 _AT_ONCE = 400
 """Readings that are compared at once."""
-_ANGLE = 0.15
-"""Difference of angles at which a pair loses half its weight, radians."""
-_ALIGNMENTS = 4
-"""Number of weighted alignments of rotations."""
 _PARALLEL = 0.02
 """Ratio of turns about the second axis to those about the main one, below which all are alike."""
-_SHORT_M = 0.02
-"""Motion below which the direction of a translation says little."""
 _OF_DIRECTIONS = 0.25
 """Weight of an angle between translations; that of a rotation is 1."""
 _POSITION_M = {True: 0.2, False: 2.0}
@@ -44,24 +35,19 @@ _LARGEST_STEP = 0.5
 """Largest change of an offset, radians, or of the logarithm of a factor in an iteration."""
 
 
-class PairMotions(NamedTuple):
-    """Motions of a camera between p pairs of images, from the images alone."""
-
-    ends: IntArray
-    """(p, 2) numbers of the images."""
-    turns: Array
-    """(p, 3) rotation vectors of first_from_second."""
-    directions: Array
-    """(p, 3) unit vectors from the first camera to the second one, in the first."""
-
-
 class JointTest:
     """Joint values (n, k) of an arm beside the motions of a camera between n images.
 
     A reading is an array (k, k + 3): the matrix, and the columns above.
     """
 
-    def __init__(self, arm: Arm, values: Array, motions: PairMotions, mount: Mount):
+    def __init__(
+        self,
+        arm: Arm,
+        values: Array,
+        motions: PairMotions,
+        mount: Mount,
+    ):
         used, ends = np.unique(motions.ends, return_inverse=True)
         self.arm = arm
         self.values = values[used]
@@ -77,20 +63,11 @@ class JointTest:
 
     def residuals(self, readings: Array) -> Array:
         """(h, 2, p, 3) differences of rotations and of directions, of h readings."""
-        between = self._between(readings)
-        stated = between.rotation.as_rotvec()
-        turns = self.motions.turns
-        rotation = np.eye(3)
-        turned = np.zeros_like(stated)
-        for _ in range(_ALIGNMENTS):
-            weights = 1 / (1 + (norms(turned) / _ANGLE) ** 2)
-            sides = stated.swapaxes(1, 2) * weights[:, None]
-            rotation = nearest_rotation(sides @ turns)
-            turned = stated @ rotation - turns
-        directions = self.motions.directions @ rotation.swapaxes(1, 2)
-        moved = self._moved(between, directions)
-        unit = moved / (norms(moved)[..., None] + _SHORT_M)
-        aside = unit - directions * norms(unit)[..., None]
+        spread_m = _POSITION_M[self.mount.moves]
+        turned, aside = self.motions.residuals(
+            self._between(readings),
+            _PRIOR * len(self.ends) / spread_m**2,
+        )
         return np.stack([turned, self.of_directions * aside], 1)
 
     def _between(self, readings: Array) -> SE3:
@@ -104,26 +81,11 @@ class JointTest:
         rows = firsts[:, None, None] + self.ends
         return poses[rows[..., 0]].inverse() @ poses[rows[..., 1]]
 
-    def _moved(self, between: SE3, directions: Array) -> Array:
-        """(h, p, 3) translations of the camera at the position that fits the directions best."""
-        lever = between.rotation_matrix() - np.eye(3)
-        moved = between.translation_m
-        across = cross_matrix(directions)
-        slopes = across @ lever
-        aside = across @ moved[..., None]
-        prior = _PRIOR * len(self.ends) / _POSITION_M[self.mount.moves] ** 2
-        position = np.zeros((len(moved), 1, 3, 1))
-        for _ in range(2):
-            off = norms((aside + slopes @ position)[..., 0])
-            length = norms(moved + (lever @ position)[..., 0]) + _SHORT_M
-            weights = 1 / (length**2 + (off / _ANGLE) ** 2)
-            sides = slopes.swapaxes(2, 3) * weights[..., None, None]
-            squares = (sides @ slopes).sum(1) + prior * np.eye(3)
-            fitted = np.linalg.solve(squares, (sides @ aside).sum(1))
-            position = -fitted[:, None]
-        return moved + (lever @ position)[..., 0]
-
-    def saturated(self, readings: Array, cap: float) -> Array:
+    def saturated(
+        self,
+        readings: Array,
+        cap: float,
+    ) -> Array:
         """(h, m) residuals of h readings, each divided so that its size is below 1."""
         residuals = self.residuals(readings)
         squares = (residuals**2).sum(3, keepdims=True)
@@ -131,7 +93,11 @@ class JointTest:
         scaled = residuals / np.sqrt((squares + cap**2) * count)
         return scaled.reshape(len(readings), -1)
 
-    def costs(self, readings: Array, cap: float) -> Array:
+    def costs(
+        self,
+        readings: Array,
+        cap: float,
+    ) -> Array:
         """(h,) mean of squares that saturate at `cap`."""
         costs = []
         for some in np.array_split(readings, 1 + len(readings) // _AT_ONCE):
@@ -144,7 +110,11 @@ class JointTest:
         turned, aside = np.rad2deg(medians).tolist()
         return turned, aside / _OF_DIRECTIONS
 
-    def refined(self, readings: Array, cap: float) -> Array:
+    def refined(
+        self,
+        readings: Array,
+        cap: float,
+    ) -> Array:
         """Readings with offsets and factors that fit best: Levenberg-Marquardt, all at once."""
         spread = readings[:, :, SPREAD:]
         used = spread.any(0)

@@ -45,11 +45,19 @@ class JointMap:
 
     @classmethod
     def of_columns(
-        cls, joints: Sequence[str], columns: Sequence[str], units: Array
+        cls,
+        joints: Sequence[str],
+        columns: Sequence[str],
+        units: Array,
     ) -> Self:
         """Each joint is one column, in units (k,)."""
         offsets = np.zeros(len(units))
-        return cls((*joints,), (*columns,), np.diag(units), offsets)
+        return cls(
+            (*joints,),
+            (*columns,),
+            np.diag(units),
+            offsets,
+        )
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -66,13 +74,22 @@ class JointMap:
             for column, factor in row.items():
                 matrix[i, columns.index(column)] = factor
         offsets = np.array([offset for _, offset in rows])
-        return cls((*entries,), (*columns,), matrix, offsets)
+        return cls(
+            (*entries,),
+            (*columns,),
+            matrix,
+            offsets,
+        )
 
     def values(self, values: Array) -> Array:
         """(n, k) values of the joints, from columns (n, m)."""
         return values @ self.matrix.T + self.offsets
 
-    def with_others(self, others: Self, source: PathLike) -> Self:
+    def with_others(
+        self,
+        others: Self,
+        source: PathLike,
+    ) -> Self:
         """The joints of this map, and those of a map of all columns of a file."""
         missing = [column for column in self.columns if column not in others.columns]
         if missing:
@@ -104,7 +121,11 @@ class JointMap:
             offsets=self.offsets[rows],
         )
 
-    def after(self, matrix: Array, offsets: Array) -> Self:
+    def after(
+        self,
+        matrix: Array,
+        offsets: Array,
+    ) -> Self:
         """Joints that stand at matrix (k, k) @ what this map gives + offsets (k,)."""
         both = matrix @ self.offsets + offsets
         return replace(self, matrix=matrix @ self.matrix, offsets=both)
@@ -112,7 +133,13 @@ class JointMap:
     def record(self, rotates: Sequence[bool]) -> JsonObject:
         """The map as JSON."""
         entries = {}
-        rows = zip(self.joints, rotates, self.matrix, self.offsets, strict=True)
+        rows = zip(
+            self.joints,
+            rotates,
+            self.matrix,
+            self.offsets,
+            strict=True,
+        )
         for joint, turns, row, offset in rows:
             size = np.abs(row).max()
             entry: JsonObject = {"offset_m": offset}
@@ -121,7 +148,16 @@ class JointMap:
                 degrees = (np.rad2deg(offset) + 180) % 360 - 180
                 entry = {"offset_deg": round(degrees, 3)}
                 units = ["rad", "deg", "steps", np.rad2deg(size)]
-            exact = [unit for unit in units if np.isclose(_size(unit), size, 1e-6, 0)]
+            exact = [
+                unit
+                for unit in units
+                if np.isclose(
+                    _size(unit),
+                    size,
+                    1e-6,
+                    0,
+                )
+            ]
             (entry["unit"], *_) = *exact, "m"
             factors = np.round(row / _size(entry["unit"]), 9).tolist()
             named = zip(self.columns, factors, strict=True)
@@ -137,7 +173,12 @@ def _size(unit: Any) -> float:
 
 def _row(joint: str, entry: Any) -> tuple[dict[str, float], float]:
     """Factors of the columns of a joint, and its offset."""
-    with suppress(KeyError, TypeError, ValueError, AttributeError):
+    with suppress(
+        KeyError,
+        TypeError,
+        ValueError,
+        AttributeError,
+    ):
         size = _size(entry["unit"])
         row = {c: size * float(factor) for c, factor in entry["columns"].items()}
         degrees = entry.get("offset_deg", 0)

@@ -30,7 +30,9 @@ _ALIASES = {
 
 
 def joints_by_column(
-    columns: Sequence[str], joints: Sequence[str], ordered: bool
+    columns: Sequence[str],
+    joints: Sequence[str],
+    ordered: bool,
 ) -> dict[str, str]:
     """Joints of columns whose names differ: `shoulder_pan.pos`, `J1` for `joint_1`.
 

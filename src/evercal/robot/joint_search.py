@@ -140,7 +140,12 @@ def _judged(test: JointTest, reading: Array) -> Explained:
     """A reading with what the images and its mistakes cost."""
     mistakes = described(test.arm, reading)
     cost = float(test.costs(reading[None], _CLOSE)[0]) + _OF_MISTAKE * len(mistakes)
-    return Explained(reading, *test.errors_deg(reading), cost, mistakes)
+    return Explained(
+        reading,
+        *test.errors_deg(reading),
+        cost,
+        mistakes,
+    )
 
 
 def _best(test: JointTest, readings: Array) -> tuple[Array, Array]:
@@ -174,7 +179,12 @@ def _changes(arm: Arm) -> Array:
     count = len(same)
     changes = [same]
 
-    def change(joint: int, column: int, factor: float, offset: float = 0.0) -> None:
+    def change(
+        joint: int,
+        column: int,
+        factor: float,
+        offset: float = 0.0,
+    ) -> None:
         changed = same.copy()
         changed[joint, column] = factor
         changed[joint, OFFSET] = offset
@@ -186,7 +196,12 @@ def _changes(arm: Arm) -> Array:
     for joint in range(count):
         change(joint, joint, -1.0)
         for angle in _ZEROS * turning[joint]:
-            change(joint, joint, 1.0, angle)
+            change(
+                joint,
+                joint,
+                1.0,
+                angle,
+            )
         for other in range(max(joint - _COUPLED, 0), min(joint + _COUPLED + 1, count)):
             if other != joint:
                 change(joint, other, 1.0)
@@ -242,7 +257,15 @@ def described(arm: Arm, reading: Array) -> Strings:
     if moved.size:
         found.append(f"the columns of joints {_names(arm, moved)} are in another order")
     factors = sizes.max(1)
-    known = [np.isclose(factors, unit, 0.01, 0.0) for unit in _UNITS.values()]
+    known = [
+        np.isclose(
+            factors,
+            unit,
+            0.01,
+            0.0,
+        )
+        for unit in _UNITS.values()
+    ]
     units = np.select(known, [*_UNITS], _NORMALISED)
     normalised = _NORMALISED in units
     if normalised:

@@ -59,7 +59,11 @@ def joint_slopes(poses: SE3, arm: Arm | None) -> Array:
 
 
 def _usual(
-    poses: SE3, height: float, tool: float, link: float, heading: float
+    poses: SE3,
+    height: float,
+    tool: float,
+    link: float,
+    heading: float,
 ) -> Array:
     """(n, 6, 8) of the joints that stand as an arm of these proportions would at its poses."""
     position = poses.translation_m

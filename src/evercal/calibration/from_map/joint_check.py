@@ -8,9 +8,10 @@ from scipy.spatial.transform import Rotation
 from evercal.calibration.from_map.image_pairs import ImagePair, image_pairs
 from evercal.features.encoder import load_encoder
 from evercal.geometry import spread
+from evercal.geometry.motions import PairMotions
 from evercal.recordings.frame import MIN_TRAIN_FRAMES, Recording
 from evercal.robot.arm import Arm
-from evercal.robot.joint_agreement import JointTest, PairMotions
+from evercal.robot.joint_agreement import JointTest
 from evercal.robot.joint_search import JointVerdict, joint_search
 from evercal.robot.mount import Mount
 from evercal.typing import Array
