@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.linalg import expm
 
-from evercal.geometry import SE3, average_poses, pose_distance
+from evercal.geometry import SE3, average_poses, nearest_rotation, pose_distance
 
 
 def random_poses(
@@ -224,3 +224,12 @@ def test_unit_quaternions_stay_the_same_to_the_last_bit() -> None:
     assert (
         SE3(once.rotation_wxyz, once.translation_m).rotation_wxyz == once.rotation_wxyz
     ).all()
+
+
+def test_the_nearest_rotation_is_no_reflection() -> None:
+    rng = np.random.default_rng(0)
+    true = random_poses(rng, (50,)).rotation_matrix()
+    near = nearest_rotation(3.0 * true)
+    np.testing.assert_allclose(near, true, atol=1e-12)
+    any_matrices = nearest_rotation(rng.normal(size=(50, 3, 3)))
+    np.testing.assert_allclose(np.linalg.det(any_matrices), 1.0)

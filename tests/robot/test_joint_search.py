@@ -61,6 +61,7 @@ def percent(low: Sequence[float], high: Sequence[float]) -> Change:
 
 
 DEG = 180 / np.pi
+STEPS = np.array([1.0] * 3 + [4096 / 2 / np.pi] * 3)
 LOW = [-100, -110, -90, -105, -150]
 HIGH = [120, 95, 100, 90, 150]
 SINGLE = {
@@ -83,6 +84,8 @@ SINGLE = {
     "degrees": ("panda", units(*[DEG] * 7), ["^values are in degrees$"]),
     "mixed units": ("welder", units(1, 1, 1, DEG, DEG, DEG), ["joint_6 are in degrees"]),
     "steps": ("hobby", lambda v: 2048 + v * 4096 / 2 / np.pi, ["steps of the motor"]),
+    "steps beside slides": ("gantry", lambda v: v * STEPS + [0, 0, 0, 2048, 2048, 2048],
+                            ["joints joint_4, joint_5, joint_6 are in steps"]),
     "zero and sense": ("hobby", both(sense(4), zero(2, -90)), ["elbow_flex is", "wrist_roll"]),
     "coupling and sense": ("welder", both(sense(5), coupled(2, 1, 1)), ["joint_3 is", "joint_6"]),
     "normalised": ("hobby", percent(LOW, HIGH), ["values are normalised"]),

@@ -100,7 +100,11 @@ class JointMap:
         matrix = np.zeros((len(self.joints), len(others.columns)))
         matrix[:, [*map(others.columns.index, self.columns)]] = self.matrix
         rest = []
-        for joint, column in zip(others.joints, others.columns, strict=True):
+        for joint, column in zip(
+            others.joints,
+            others.columns,
+            strict=True,
+        ):
             if joint not in self.joints and column not in self.columns:
                 rest.append(joint)
         kept = others.of(rest)

@@ -152,7 +152,11 @@ def _best(test: JointTest, readings: Array) -> tuple[Array, Array]:
     """The best readings, and the same refined, without those that become alike."""
     rows = np.argsort(test.costs(readings, _WIDE), kind="stable")[:_REFINED]
     best = test.refined(test.refined(readings[rows], _WIDE), _CLOSE)
-    _, first = np.unique(np.round(best, 2), axis=0, return_index=True)
+    _, first = np.unique(
+        np.round(best, 2),
+        axis=0,
+        return_index=True,
+    )
     return readings[rows[first]], best[first]
 
 
