@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
+from scipy.stats import f
 
 from evercal.geometry import Camera
 from evercal.mapping.bundle_equations import BundleTracks, Linearised
@@ -20,6 +21,8 @@ SIGNIFICANT = 6.0
 """Least change in standard deviations."""
 EXPLAINED = 0.5
 """Share of the squared deviations that one step must explain."""
+CHANCE = 1e-4
+"""Probability that the best step among random deviations counts."""
 FEWEST = 4
 """Least number of frames before and after a step."""
 LEAST_VARIANCE = 1e-7
@@ -58,7 +61,9 @@ class LensChange(NamedTuple):
         scatter = max(0.0, squares / len(known) - 1) / weight.mean()
         scatter = math.sqrt(scatter)
         explained = squares - left
-        if explained > EXPLAINED * squares:
+        freedom = len(known) - 2
+        by_chance = f.isf(CHANCE / len(known), 1, freedom) * left / freedom
+        if explained > max(EXPLAINED * squares, by_chance):
             size, first = best
         else:
             size, first = scatter, -1
