@@ -12,6 +12,11 @@ from evercal.geometry import SE3, Camera, pose_distance
 from evercal.recordings import Frame, Recording, load_recording, write_image
 from evercal.recordings.inspection import inspect_recording
 from evercal.recordings.poses import pose_evidence
+from evercal.recordings.poses.conventions import (
+    numbers_from_poses,
+    pose_convention,
+    poses_from_numbers,
+)
 from evercal.recordings.poses.pose_evidence import rotation_warnings
 from evercal.recordings.samples import FOLDER
 
@@ -34,24 +39,25 @@ def bedroom() -> tuple[Frame, ...]:
 @pytest.fixture(scope="module", autouse=True)
 def matched_once() -> Iterator[None]:
     """Every pair of images is matched once for all tests."""
-    real = pose_evidence.measured_rotation
+    real = pose_evidence.measured_motion
     cache = {}
 
-    def cached(first: Frame, second: Frame) -> np.ndarray | None:
+    def cached(first: Frame, second: Frame) -> SE3 | None:
         key = first.image, second.image
         if key not in cache:
             cache[key] = real(first, second)
         return cache[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pose_evidence, "measured_rotation", cached)
+        patch.setattr(pose_evidence, "measured_motion", cached)
         yield
 
 
 def test_measured_rotations_agree_with_true_poses(bedroom: tuple[Frame, ...]) -> None:
     poses = stated(bedroom)
-    pairs, measured = pose_evidence.measured_pairs(bedroom, poses)
-    first, second = pairs.T
+    motions = pose_evidence.measured_motions(bedroom, poses)
+    first, second = motions.ends.T
+    measured = motions.turns
     assert len(measured) >= 8
     rotation = Rotation.from_quat(poses.rotation_wxyz, scalar_first=True)
     off = (
@@ -121,6 +127,22 @@ def test_wrong_gripper_poses_are_reported(bedroom: tuple[Frame, ...]) -> None:
         "are angles in the stated unit" in warning
         or "the angles in another unit" in warning
     )
+
+
+@pytest.mark.parametrize(
+    ("written", "read"),
+    [("kuka:m", "yaskawa:m"), ("yaskawa:m", "kuka:m"), ("ur:rad", "kuka:m:rad")],
+)
+def test_what_is_proposed_fits_translations_too(
+    bedroom: tuple[Frame, ...], written: str, read: str
+) -> None:
+    """In the opposite order, angles rotate as their inverse does."""
+    gripper = stated(bedroom) @ GRIPPER_FROM_CAMERA.inverse()
+    numbers = numbers_from_poses(gripper, pose_convention(written))
+    wrong = poses_from_numbers(numbers, pose_convention(read))
+    (warning,) = rotation_warnings(bedroom, wrong, False, read)
+    assert f"if they are in another order, {written[:3]}" in warning
+    assert "inverse" not in warning
 
 
 def test_still_camera_is_reported(bedroom: tuple[Frame, ...]) -> None:

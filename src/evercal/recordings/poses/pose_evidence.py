@@ -10,10 +10,10 @@ from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evercal.geometry import SE3, norms, spread
+from evercal.geometry.motions import PairMotions
 from evercal.recordings.frame import Frame
 from evercal.recordings.poses.conventions import (
     OPENGL_FROM_OPENCV,
@@ -51,6 +51,10 @@ BETTER = 3.0
 """Factor by which the error of another reading must be smaller to be named."""
 CLOSE_DEG = 0.5
 """Further readings are named within this of the smallest error, degrees."""
+DIRECTIONS = 2.0
+"""Readings that differ by this factor more in the directions of translations are not named."""
+POSITION_PRIOR = 0.4
+"""Weight of the position of a camera in the gripper, see `PairMotions.residuals`, 1/m^2."""
 GRIPPER_AGREE_DEG = 1.0
 """`AGREE_DEG` of grippers: their free fixed rotation lets wrong readings fit better."""
 GRIPPER_BETTER = 2.0
@@ -67,7 +71,8 @@ def rotation_warnings(
     (n,) frames are in recorded order, (n,) poses base_from_camera or else base_from_gripper, read
     from numbers in a convention.
     """
-    pairs, measured = measured_pairs(frames, poses)
+    motions = measured_motions(frames, poses)
+    measured = motions.turns
     if len(measured) < MIN_PAIRS:
         return []
     owner = "camera"
@@ -84,11 +89,14 @@ def rotation_warnings(
         owner = "gripper"
         error_of = _fitted_error_deg  # a fixed rotation to the camera is not known
         better = GRIPPER_BETTER
-    stated = _between(poses.rotation, pairs)
+    stated = _between(poses, motions).rotation.as_rotvec()
     given = pose_convention(convention) if convention else None
-    readings = dict(_readings(poses, pairs, of_camera, given))
+    readings = {}
+    errors = {}
+    for name, other in _readings(poses, of_camera, given):
+        readings[name] = between = _between(other, motions)
+        errors[name] = error_of(measured, between.rotation.as_rotvec())
     error = error_of(measured, stated)
-    errors = {name: error_of(measured, turned) for name, turned in readings.items()}
     improved = min(errors.values()) < error / better
     agree = GRIPPER_AGREE_DEG if improved and not of_camera else AGREE_DEG
     if error < agree:
@@ -103,6 +111,10 @@ def rotation_warnings(
     least = min(errors.values())
     if least < min(AGREE_DEG, error / better):
         fitting = [r for r in errors if errors[r] < least + CLOSE_DEG]
+        if not of_camera:
+            aside = [_aside(motions, readings[name]) for name in fitting]
+            most = DIRECTIONS * min(aside)
+            fitting = [r for r, off in zip(fitting, aside, strict=True) if off <= most]
         return [
             f"{problem}; the poses fit ({least:.1f} deg) if they are {', or '.join(fitting)}"
         ]
@@ -113,20 +125,18 @@ def rotation_warnings(
 
 
 def _readings(
-    poses: SE3, pairs: NDArray[np.intp], of_camera: bool, convention: Given
-) -> Iterator[tuple[str, Array]]:
-    """(n, 3) rotation vectors first_from_second of pairs in other readings, with their names."""
-    for name, other in _other_orders(poses, convention):
-        yield name, _between(other.rotation, pairs)
-    stated = _between(poses.rotation, pairs)
-    inverse = _between(poses.inverse().rotation, pairs)
+    poses: SE3, of_camera: bool, convention: Given
+) -> Iterator[tuple[str, SE3]]:
+    """Poses in other readings, with their names."""
+    yield from _other_orders(poses, convention)
+    inverse = poses.inverse()
     owner = "camera" if of_camera else "gripper"
     yield f"{owner}_from_base, the inverse (append :inverse)", inverse
     if of_camera:
-        turn = OPENGL_FROM_OPENCV.rotation
-        name = "with OpenGL's camera axes (right, up, backward)"
-        yield f"{name} (append :opengl)", turn.apply(stated)
-        yield f"the inverse {name} (append :inverse:opengl)", turn.apply(inverse)
+        turn = OPENGL_FROM_OPENCV
+        name = "with OpenGL's camera axes"
+        yield f"{name} (right, up, backward) (append :opengl)", poses @ turn
+        yield f"the inverse {name} (append :inverse:opengl)", inverse @ turn
 
 
 def _other_orders(poses: SE3, convention: Given) -> Iterator[tuple[str, SE3]]:
@@ -146,29 +156,35 @@ def _other_orders(poses: SE3, convention: Given) -> Iterator[tuple[str, SE3]]:
             yield text, poses_from_numbers(numbers, other)
 
 
-def _between(rotation: Rotation, pairs: NDArray[np.intp]) -> Array:
-    """(n, 3) rotation vectors first_from_second of pairs (n, 2)."""
-    first, second = pairs.T
-    return (rotation[first].inv() * rotation[second]).as_rotvec()
+def _between(poses: SE3, motions: PairMotions) -> SE3:
+    """(p,) first_from_second of the pairs."""
+    first, second = motions.ends.T
+    return poses[first].inverse() @ poses[second]
 
 
-def measured_pairs(
-    frames: Sequence[Frame], poses: SE3
-) -> tuple[NDArray[np.intp], Array]:
-    """(n, 2) frames of the pairs that match, and (n, 3) `measured_rotation` of each."""
-    pairs = []
-    vectors = []
+def _aside(motions: PairMotions, between: SE3) -> float:
+    """Median difference of the directions of translations, after the best hand-eye transform."""
+    _, aside = motions.residuals(between[None], POSITION_PRIOR)
+    return float(np.median(norms(aside)))
+
+
+def measured_motions(frames: Sequence[Frame], poses: SE3) -> PairMotions:
+    """Motions of the camera between the pairs of frames that match."""
+    ends = []
+    motions = [SE3.identity()]
     for first, second in _pairs(poses):
-        vector = measured_rotation(frames[first], frames[second])
-        if vector is not None:
-            pairs.append((first, second))
-            vectors.append(vector)
-    indices = np.array(pairs, np.intp).reshape(-1, 2)
-    return indices, np.array(vectors)
+        motion = measured_motion(frames[first], frames[second])
+        if motion:
+            ends.append((first, second))
+            motions.append(motion)
+    between = SE3.stack(motions)[1:]
+    turns = between.rotation.as_rotvec()
+    pairs = np.array(ends, np.int64).reshape(-1, 2)
+    return PairMotions(pairs, turns, between.translation_m)
 
 
-def measured_rotation(first: Frame, second: Frame) -> Array | None:
-    """(3,) rotation vector first_from_second in radians; None if there are too few matches."""
+def measured_motion(first: Frame, second: Frame) -> SE3 | None:
+    """first_from_second with a translation of length 1; None if there are too few matches."""
     first_rays, first_descriptors = _features(first)
     second_rays, second_descriptors = _features(second)
     if min(len(first_rays), len(second_rays)) < MIN_MATCHES:
@@ -193,9 +209,9 @@ def measured_rotation(first: Frame, second: Frame) -> Array | None:
     )
     if np.shape(matrix) != (3, 3) or int(inliers.sum()) < MIN_MATCHES:
         return None
-    _, matrix, *_ = cv2.recoverPose(matrix, a, b, np.eye(3), mask=inliers)
-    second_from_first = Rotation.from_matrix(matrix)
-    return second_from_first.inv().as_rotvec()
+    _, matrix, shift, _ = cv2.recoverPose(matrix, a, b, np.eye(3), mask=inliers)
+    second_from_first = SE3.of(Rotation.from_matrix(matrix), shift[:, 0])
+    return second_from_first.inverse()
 
 
 def _features(frame: Frame) -> tuple[Array, Float32Array]:
