@@ -67,7 +67,7 @@ CASES: list[tuple[Camera, dict, str]] = [
     (PLAIN, {"distortion": (-0.3, 0.09, 0, 0)}, TWICE),
     (PLAIN, {"distortion": (0.12, -0.2, 0, 0)}, TWICE),
     (PLAIN, {"distortion": (-0.08, 0, 0, 0)}, TWICE),
-    (BENT, {"distortion": ()}, "its distortion is another"),
+    (BENT, {"distortion": ()}, "it has no distortion, the lens does"),
     (BENT, {"distortion": (-0.5, 0.3, 0, 0)}, "its distortion is another"),
 ]
 
@@ -78,7 +78,7 @@ def check_contradiction(true: Camera, change: dict, words: str) -> None:
     widened, said = compared_lens(poses)
     assert said.startswith("the board contradicts the camera file: ")
     assert re.search(words, said)
-    assert "moves the corners of the image by" in said
+    assert re.search(r"it moves pixels by up to [1-9]", said)
     free = board_poses(CHESSBOARD, true, views(true, "chessboard"))
     sigmas = []
     errors = []
