@@ -65,6 +65,23 @@ def test_points_of_a_depth_camera_place_it(
     assert sum(paired(count, seed, wreck) < 12.6 for seed in range(6)) >= 5
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_the_base_may_be_behind_the_camera(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = SE3.exp([0.6, 0.2, 0.5, 0, 0, 0]) @ SE3.exp([0, 0, 0, 0.3 * seed, 1.6, 0])
+    seen = rng.uniform([-0.22, -0.15, 0.6], [0.22, 0.15, 1.0], (8, 3))
+    names = [f"p{i}" for i in range(8)]
+    known = dict(zip(names, truth.apply(seen), strict=True))
+    pixels = CAMERA.project(seen) + rng.normal(0, 0.5, (8, 2))
+    picks = [
+        PickedPoint("a.png", name, pixel)
+        for name, pixel in zip(names, pixels, strict=True)
+    ]
+    found = solve_picks(known, picks, CAMERA, 5e-4, 1.0)
+    assert truth.inverse().translation_m[2] < 0
+    assert found.uncertain_pose.squared_mahalanobis(truth) < 16.8
+
+
 @pytest.mark.parametrize(
     ("wreck", "message"),
     [

@@ -324,15 +324,13 @@ def board_pose_candidates(
             view.points_m, view.pixels, camera.matrix(), distortion, flags=solver
         )
         for rotvec, translation in zip(rotvecs, translations, strict=True):
-            if np.isfinite([rotvec, translation]).all() and translation[2] > 0:
-                rotation = Rotation.from_rotvec(np.ravel(rotvec))
-                poses.append(
-                    SE3.of(
-                        rotation,
-                        np.ravel(translation),
-                        canonical=False,
-                    )
-                )
+            if not np.isfinite([rotvec, translation]).all():
+                continue
+            rotation = Rotation.from_rotvec(np.ravel(rotvec))
+            pose = SE3.of(rotation, np.ravel(translation), canonical=False)
+            # The origin may be behind the camera, where points are those of a base.
+            if pose.apply(view.points_m)[:, 2].mean() > 0:
+                poses.append(pose)
     return poses
 
 
