@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -200,6 +201,33 @@ def test_cameras_in_parts_are_named(tmp_path: Path) -> None:
         solve_rig(read_sightings(files[:1]))
     with pytest.raises(InputError, match="name one camera twice"):
         read_sightings([files[0], files[0]])
+
+
+def test_many_moments_take_linear_memory(tmp_path: Path) -> None:
+    rows = {"left": range(200), "right": range(200)}
+    seen = read_sightings(tables(tmp_path, rows))
+    tracemalloc.start()
+    try:
+        rig = solve_rig(seen)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 20e6
+    pose = rig.relative[0].first_from_second
+    assert pose.squared_mahalanobis(CAMERAS["right"]) < 16.8
+
+
+def test_images_without_numbers_are_no_common_moment(tmp_path: Path) -> None:
+    rows = {"left": range(4), "right": range(4)}
+    files = tables(tmp_path, rows)
+    for file in files:
+        lines = file.read_text().splitlines()
+        for i in range(1, 5):
+            name = f"{file.stem}_{'abcd'[i - 1]}.png"
+            lines[i] = ",".join([name, *lines[i].split(",")[1:]])
+        file.write_text("\n".join(lines))
+    with pytest.raises(InputError, match="at 0 moments"):
+        solve_rig(read_sightings(files))
 
 
 def inverse(lines: list[list[str]]) -> None:

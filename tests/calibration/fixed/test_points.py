@@ -99,6 +99,12 @@ def test_points_that_no_motion_explains_are_refused(
         paired(12, 1, wreck)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_few_points_of_a_mirrored_axis_are_refused(seed: int) -> None:
+    with pytest.raises(InputError, match="mirrored"):
+        paired(9, seed, lambda base: base * [1, -1, 1])
+
+
 def test_two_points_are_too_few_and_a_depth_scale_is_named() -> None:
     with pytest.raises(InputError, match="give 3 or more"):
         paired(2, 0, np.copy)

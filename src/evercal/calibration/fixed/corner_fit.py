@@ -3,19 +3,28 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.stats import chi2, f
 
-from evercal.calibration.boards.corners import BEND, board_pose, board_pose_candidates
+from evercal.calibration.boards.corners import (
+    BEND,
+    Bend,
+    BoardPose,
+    board_pose,
+    board_pose_candidates,
+)
 from evercal.calibration.boards.intrinsics import lens_estimate, moved_lens
-from evercal.calibration.pose_pairs.pairs import BoardCorners, Measured, measured
+from evercal.calibration.boards.row_shift import CornerNoise
+from evercal.calibration.pose_pairs.pairs import BoardCorners
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, pose_distance
+from evercal.geometry import SE3, Camera, UncertainPose, pose_distance
 from evercal.typing import Array
 
 _USUAL_PX = 0.3
 """Usual noise of a corner, which counts as much as `_FREEDOM` residuals."""
 _FREEDOM = 4.0
-_ROUNDS = 3
-"""Changes of the intrinsics."""
+_ROUNDS = 4
+"""Fits of the poses, between which the intrinsics change."""
 _NO_PRINT = 1e18
 """Information on the shape of points that are no print."""
 _WORSE = 25.0
@@ -27,22 +36,37 @@ _OTHER_RAD = np.deg2rad(4.0)
 class CornerFit(NamedTuple):
     """Board poses with their errors."""
 
-    lens: Measured
-    poses: SE3
-    """(n,) camera_from_board."""
-    covariance: Array
-    """(n, 6, 6) by the noise of the corners."""
-    slopes: Array
-    """(n, 6, q) by errors of intrinsics and print of one standard deviation each."""
+    corners: BoardCorners
+    camera: Camera
+    bend: Bend
+    fits: list[BoardPose]
     sigma_px: float
     freedom: float
     """Degrees of freedom of the noise."""
-    corners: BoardCorners
+    slopes: Array
+    """(n, 6, q) by errors of intrinsics and print of one standard deviation each."""
+
+    @property
+    def poses(self) -> SE3:
+        """(n,) camera_from_board."""
+        return SE3.stack([fit.camera_from_board for fit in self.fits])
+
+    @property
+    def covariance(self) -> Array:
+        """(n, 6, 6) by the noise of the corners."""
+        return self.sigma_px**2 * np.stack([fit.unit_covariance for fit in self.fits])
+
+    @property
+    def first(self) -> UncertainPose:
+        """The first camera_from_board, with all its errors."""
+        slopes = self.slopes[0]
+        covariance = self.covariance[0] + slopes @ slopes.T
+        return UncertainPose(self.poses[0], widening(self.freedom) * covariance)
 
     @property
     def lenses(self) -> dict[str, Camera]:
         """Intrinsics by origin, see `Calibration`."""
-        known = {"estimated": self.lens.camera}
+        known = {"estimated": self.camera}
         if self.corners.stated:
             known["stated"] = self.corners.camera
         return known
@@ -51,7 +75,7 @@ class CornerFit(NamedTuple):
         """Refuse corners that fit two poses alike, in another order or as a flat board."""
         evidence = 0.0
         angle = 0.0
-        for view, best in zip(self.corners.views, self.lens.poses, strict=True):
+        for view, best in zip(self.corners.views, self.fits, strict=True):
             if self.corners.turned(view):
                 raise InputError(
                     "this chessboard looks the same after a turn, so the camera may be at either"
@@ -59,8 +83,8 @@ class CornerFit(NamedTuple):
                     " corners are even one way and odd the other"
                 )
             worse = np.inf
-            for start in board_pose_candidates(view, self.lens.camera):
-                other = board_pose(view, self.lens.camera, start, self.lens.bend)
+            for start in board_pose_candidates(view, self.camera):
+                other = board_pose(view, self.camera, start, self.bend)
                 turn = pose_distance(best.camera_from_board, other.camera_from_board)[1]
                 if turn > _OTHER_RAD:
                     worse = min(worse, other.squared_px - best.squared_px)
@@ -74,9 +98,13 @@ class CornerFit(NamedTuple):
             )
 
 
+def widening(freedom: float) -> float:
+    """Factor of the covariance (6, 6) of a pose whose noise was estimated with few freedoms."""
+    return float(6 * f.isf(0.05, 6, freedom) / chi2.isf(0.05, 6))
+
+
 def corner_fit(
     corners: BoardCorners,
-    starts: SE3,
     touched_px: float = 0.0,
 ) -> CornerFit:
     """Estimate poses and intrinsics.
@@ -87,33 +115,24 @@ def corner_fit(
     if touched_px:
         prior.information[-len(BEND) :, -len(BEND) :] = _NO_PRINT * np.eye(len(BEND))
     usual_px = touched_px or _USUAL_PX
-    lens = measured(corners, corners.camera, starts)
-    freedom = sum(2 * pose.corners - 6 for pose in lens.poses)
-    sigma_px = usual_px
-    information = prior.information
-    for _ in range(_ROUNDS):
-        squared = _FREEDOM * usual_px**2 + freedom * lens.sigma_px**2
-        sigma_px = float(np.sqrt(squared / (_FREEDOM + freedom)))
-        change, information = lens_estimate(
-            lens.poses, sigma_px, lens.camera, lens.bend, prior
-        )
-        camera, bend = moved_lens(lens.camera, lens.bend, change)
+    camera = corners.camera
+    bend = Bend.none(corners.views)
+    change = np.zeros(len(prior.mean))
+    rounds = 0
+    while True:
+        camera, bend = moved_lens(camera, bend, change)
         # With other intrinsics, the other pose of a flat board may be the better one.
-        again = lens.poses
-        if not touched_px:
-            again = [board_pose(view, camera, None, bend) for view in corners.views]
-        starts = SE3.stack([pose.camera_from_board for pose in again])
-        lens = measured(corners, camera, starts, bend)
-    # Scaled, as information on a bend and on a focal length differ by orders of magnitude.
-    unit = 1 / np.sqrt(information.diagonal())
-    root = np.linalg.cholesky(information * unit * unit[:, None])
-    slopes = np.stack([pose.lens_slope for pose in lens.poses])
-    return CornerFit(
-        lens,
-        SE3.stack([pose.camera_from_board for pose in lens.poses]),
-        sigma_px**2 * np.stack([pose.unit_covariance for pose in lens.poses]),
-        slopes @ (unit[:, None] * np.linalg.inv(root).T),
-        sigma_px,
-        _FREEDOM + freedom,
-        corners,
-    )
+        fits = [board_pose(view, camera, None, bend) for view in corners.views]
+        freedom = sum(2 * fit.corners - 6 for fit in fits)
+        squared = freedom * CornerNoise.plain(fits).sigma_px ** 2
+        squared += _FREEDOM * usual_px**2
+        sigma_px = float(np.sqrt(squared / (_FREEDOM + freedom)))
+        change, information = lens_estimate(fits, sigma_px, camera, bend, prior)
+        rounds += 1
+        if rounds == _ROUNDS:
+            break
+    slopes = np.stack([fit.lens_slope for fit in fits])
+    root = np.linalg.cholesky(information)
+    by_lens = solve_triangular(root, slopes.reshape(-1, len(root)).T, lower=True)
+    slopes = by_lens.T.reshape(slopes.shape)
+    return CornerFit(corners, camera, bend, fits, sigma_px, _FREEDOM + freedom, slopes)

@@ -5,15 +5,23 @@ The position of the gripper, or of its tool, is that of the point that the camer
 
 import numpy as np
 from scipy.spatial.distance import pdist
-from scipy.stats import chi2, f
+from scipy.stats import chi2
 
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.checks import Checks
-from evercal.calibration.fixed.sightings import image_uses, judged
-from evercal.calibration.from_map.by_points import umeyama
+from evercal.calibration.fixed.corner_fit import widening
+from evercal.calibration.fixed.sightings import judged
+from evercal.calibration.from_map.by_points import require_spread, umeyama
 from evercal.calibration.unseen.touched import DEPTH_M, DEPTH_SHARE, TOUCH_M
 from evercal.errors import InputError
-from evercal.geometry import SE3, cross_matrix, norms, unit_vectors
+from evercal.geometry import (
+    UncertainPose,
+    cross_matrix,
+    in_parent_axes,
+    norms,
+    spread,
+    unit_vectors,
+)
 from evercal.recordings.poses.pairing import counted
 from evercal.typing import Array, Strings
 
@@ -21,8 +29,12 @@ _LEAST = 3
 """Least number of points."""
 _DRAWS = 100
 """Number of samples of three points, one of which is without outliers."""
+_COMPARED = 200
+"""Number of points whose distances are compared."""
 _OTHER_UNIT = 0.2
 """Logarithm of a ratio of lengths above which robot and camera have other units."""
+_MIRRORED_AGREES = 4.0
+"""Factor by which mirrored points agree better if an axis has the wrong sign."""
 _SIGMAS = 4.0
 """Distance of an outlier, standard deviations."""
 _LEAST_USED = 0.6
@@ -56,84 +68,77 @@ def solve_points(
             f"{counted(len(seen), 'point')} by robot and camera; give {_LEAST} or more, better 20,"
             " not all on one line"
         )
-    umeyama(seen, robot, True)  # refuses points on one line
-    extent = float(np.median(pdist(seen)))
-    ratio = float(np.median(pdist(robot))) / extent
+    require_spread(robot)
+    rows = spread(len(seen), _COMPARED)
+    extent = float(np.median(pdist(seen[rows])))
+    ratio = float(np.median(pdist(robot[rows]))) / extent
     if abs(np.log(ratio)) > _OTHER_UNIT:
         raise InputError(
             f"the robot's points lie {ratio:.4g} times as far apart as the camera's: give both in"
             " metres, and each point in the same row of both"
         )
     misses = _least_median(seen, robot)
+    mirrored = np.median(_least_median(seen * [1, 1, -1], robot))
     sigma = float(np.median(misses)) / chi2.median(3) ** 0.5
     used = misses < _SIGMAS * max(sigma, TOUCH_M)
-    if used.mean() < _LEAST_USED or sigma > _MOST_APART * extent:
-        mirrored = np.median(_least_median(seen * [1, 1, -1], robot))
+    is_mirrored = _MIRRORED_AGREES * max(mirrored, TOUCH_M) < sigma
+    if used.mean() < _LEAST_USED or sigma > _MOST_APART * extent or is_mirrored:
         reason = _MIRRORED if mirrored < _MOST_APART * extent else _UNMATCHED
         raise InputError(
             f"the points of robot and camera agree only to {1000 * sigma:.0f} mm: {reason}"
         )
     shape = umeyama(seen[used], robot[used], False)
-    about = seen[used] - seen[used].mean(0)
     rest = norms(shape.points(seen[used]) - robot[used])
+    about = seen[used] - seen[used].mean(0)
     told = (about**2).sum() / (TOUCH_M**2 + (rest**2).mean() / 3)
     scale = shape.scale ** float(told / (told + DEPTH_SHARE**-2))
     pose = umeyama(scale * seen[used], robot[used], True).base_from_map
-    misses = norms(pose.apply(scale * seen) - robot)
-    covariance = _covariance(pose, scale * seen[used], robot[used])
-    spread = float(np.sqrt(covariance[6, 6]))
+    covariance = _covariance(pose.inverse().apply(robot[used]), scale * seen[used])
+    scale_sigma = float(np.sqrt(covariance[6, 6]))
     warnings = []
-    if abs(scale - 1) > max(_SCALE_SIGMAS * spread, 0.01):
+    if abs(scale - 1) > max(_SCALE_SIGMAS * scale_sigma, 0.01):
         warnings.append(
             f"the camera's lengths are {100 / scale - 100:+.1f} % longer than the robot's: check"
             " its depth scale; the calibration allows for it"
         )
     checks = Checks(
-        residual_mm=1000 * float(np.sqrt((misses[used] ** 2).mean())),
-        residual_deg=0.0,
         target_m=float(np.median(norms(seen))),
         scale=scale,
-        scale_sigma=spread,
+        scale_sigma=scale_sigma,
         left_open=(_SAME_POINT,),
         warnings=warnings,
     )
-    images = image_uses(names, used, 1000 * misses)
-    return judged(
-        Calibration(
-            "eye_to_hand", pose, covariance[:6, :6], images=images, checks=checks
-        )
-    )
+    misses = norms(pose.apply(scale * seen) - robot)
+    own = in_parent_axes(pose.rotation_matrix(), covariance[:6, :6])
+    apart = np.outer(misses, [1, 0])
+    return judged(UncertainPose(pose, own), names, used, apart, checks)
 
 
 def _covariance(
-    pose: SE3,
+    stated: Array,
     seen: Array,
-    robot: Array,
 ) -> Array:
-    """(7, 7) of the pose and of the logarithm of the scale; the noise along the ray is its own."""
-    count = len(seen)
-    misses = pose.apply(seen) - robot
+    """(7, 7) of a motion of the camera in its axes and of the logarithm of the scale.
+
+    Both points (n, 3) are in the camera frame. The noise along the ray is another than that across.
+    """
+    ray = unit_vectors(seen)
+    along = ray[:, :, None] * ray[:, None]
+    misses = (stated - seen)[..., None]
+    deep = ((along @ misses) ** 2).sum()
+    squares = np.array([deep, ((misses**2).sum() - deep) / 2])
+    freedom = _FREEDOM + len(seen) - 7 / 3
     usual = np.square([DEPTH_M, TOUCH_M])
-    ray = unit_vectors(pose.rotation.apply(seen))
-    along = ((misses * ray).sum(1) ** 2).sum()
-    squares = np.array([along, ((misses**2).sum() - along) / 2])
-    freedom = _FREEDOM + count - 7 / 3
-    variance = (_FREEDOM * usual + squares) / freedom
-    slope = np.zeros((count, 3, 7))
-    slope[:, :, :3] = np.eye(3)
-    slope[:, :, 3:6] = -pose.rotation_matrix() @ cross_matrix(seen)
-    slope[:, :, 6] = pose.rotation.apply(seen)
-    noise = np.eye(3) * variance[1] + (variance[0] - variance[1]) * (
-        ray[:, :, None] * ray[:, None]
-    )
-    rows = slope.reshape(-1, 7)
-    normal = rows.T @ rows
-    normal[6, 6] += variance.mean() / DEPTH_SHARE**2
+    deep, across = (_FREEDOM * usual + squares) / freedom
+    shifts = np.broadcast_to(np.eye(3), along.shape)
+    slope = np.concatenate([shifts, -cross_matrix(seen), seen[..., None]], 2)
+    turned = slope.transpose(0, 2, 1)
+    normal = (turned @ slope).sum(0)
+    normal[6, 6] += (deep + across) / 2 / DEPTH_SHARE**2
     gain = np.linalg.inv(normal)
-    scatter = (slope.transpose(0, 2, 1) @ noise @ slope).sum(0)
-    covariance = gain @ scatter @ gain
-    covariance *= 6 * f.isf(0.05, 6, 2 * freedom) / chi2.isf(0.05, 6)
-    return (covariance + covariance.T) / 2
+    noise = across * np.eye(3) + (deep - across) * along
+    scatter = (turned @ noise @ slope).sum(0)
+    return widening(2 * freedom) * gain @ scatter @ gain
 
 
 def _least_median(

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from evercal.calibration.calibration import Calibration, ImageUse
+from evercal.calibration.checks import Checks
 from evercal.calibration.fixed.corner_fit import CornerFit, corner_fit
 from evercal.calibration.pose_pairs.checks import SIZE_SIGMA
 from evercal.calibration.pose_pairs.pair_files import PoseRows, read_camera_poses
 from evercal.calibration.verdict import verdict
 from evercal.classes import frozen_arrays
 from evercal.errors import InputError
-from evercal.geometry import SE3, norms, unit_vectors
+from evercal.geometry import SE3, UncertainPose, norms
 from evercal.recordings.poses.row_files import last_number, without_ending
 from evercal.typing import Array, BoolArray, Strings
 
@@ -66,7 +67,7 @@ class Sightings:
         shown = tuple(moments[row] for row in rows)
         poses = table.poses[rows]
         if corners := table.corners_of(rows):
-            fit = corner_fit(corners, poses)
+            fit = corner_fit(corners)
             return cls(name, images, shown, fit.poses, fit.covariance, fit.slopes, fit)
         depth = SIZE_SIGMA * poses.translation_m * [0, 0, 1]
         shared = np.pad(depth, ((0, 0), (0, 3)))[..., None]
@@ -100,11 +101,10 @@ def _usual(
 ) -> Array:
     """(n, 6, 6) usual covariance of poses, whose size is estimated later."""
     place = poses.translation_m
-    ray = unit_vectors(place)[:, :, None]
-    along = ray @ ray.transpose(0, 2, 1)
     covariance = np.zeros((len(poses), 6, 6))
-    covariance[:, :3, :3] = _ACROSS**2 * np.eye(3) + _ALONG**2 * along
-    covariance[:, :3, :3] *= (place**2).sum(1)[:, None, None]
+    covariance[:, :3, :3] = _ALONG**2 * place[:, :, None] * place[:, None]
+    across = (_ACROSS * norms(place)) ** 2
+    covariance[:, :3, :3] += across[:, None, None] * np.eye(3)
     covariance[:, 3:, 3:] = _TURNED**2 * np.eye(3)
     return covariance
 
@@ -114,45 +114,66 @@ def _moments(
 ) -> list[Strings]:
     """Names of the moments of all rows."""
     names = [tuple(map(without_ending, table.row_names())) for table in tables]
-    if all(table.names for table in tables):
-        if any({*first} & {*second} for first, second in combinations(names, 2)):
-            return names
-        return [tuple(str(last_number(name)) for name in own) for own in names]
-    counts = [len(own) for own in names]
-    if len({*counts}) > 1:
-        raise InputError(
-            f"`camera_poses`: the files hold {counts} poses; give images of one moment one name, in"
-            " a column image"
-        )
-    return [names[0] for _ in names]
+    if not all(table.names for table in tables):
+        counts = [len(own) for own in names]
+        if len({*counts}) > 1:
+            raise InputError(
+                f"`camera_poses`: the files hold {counts} poses; give images of one moment one"
+                " name, in a column image"
+            )
+        return [names[0] for _ in names]
+    if any({*first} & {*second} for first, second in combinations(names, 2)):
+        return names
+    return [tuple(map(_numbered, own)) for own in names]
 
 
-def image_uses(
-    names: Sequence[str],
-    used: BoolArray,
-    mm: Array,
-) -> tuple[ImageUse, ...]:
-    """The use of images or points, by whether they agree and how far they are off."""
-    uses = []
-    for name, agrees, miss in zip(names, used.tolist(), mm.tolist(), strict=True):
-        reason = "" if agrees else f"is {miss:.1f} mm from where the others put it"
-        uses.append(ImageUse(name, agrees, reason, miss))
-    return tuple(uses)
+def _numbered(
+    name: str,
+) -> str:
+    """The last number in a name, else the name."""
+    number = last_number(name)
+    return name if number is None else str(number)
 
 
 def judged(
-    calibration: Calibration,
+    pose: UncertainPose,
+    names: Sequence[str],
+    used: BoolArray,
+    apart: Array,
+    checks: Checks,
     fit: CornerFit | None = None,
 ) -> Calibration:
-    """The calibration with its intrinsics, its verdict and the number of its images or points."""
+    """A fixed camera with its verdict.
+
+    Args:
+        pose: base_from_camera.
+        names: (n,) images or points.
+        used: (n,) whether they agree with the others.
+        apart: (n, 2) how far they are off, metres and radians.
+        checks: The other checks.
+        fit: Corners, with the intrinsics.
+    """
+    usual = np.sqrt((apart[used] ** 2).mean(0))
     checks = replace(
-        calibration.checks,
-        poses_given=len(calibration.images),
-        poses_used=sum(image.used for image in calibration.images),
+        checks,
+        poses_given=len(used),
+        poses_used=int(used.sum()),
+        residual_mm=1000 * float(usual[0]),
+        residual_deg=float(np.rad2deg(usual[1])),
         corner_sigma_px=fit.sigma_px if fit else None,
     )
-    calibration = replace(calibration, checks=checks)
-    if fit:
-        camera = fit.lens.camera
-        calibration = replace(calibration, camera=camera, lenses=fit.lenses)
+    images = []
+    for name, agrees, metres in zip(names, used.tolist(), apart[:, 0], strict=True):
+        mm = 1000 * float(metres)
+        reason = "" if agrees else f"is {mm:.1f} mm from where the others put it"
+        images.append(ImageUse(name, agrees, reason, mm))
+    calibration = Calibration(
+        "eye_to_hand",
+        pose.pose,
+        pose.covariance,
+        camera=fit.camera if fit else None,
+        images=tuple(images),
+        lenses=fit.lenses if fit else {},
+        checks=checks,
+    )
     return replace(calibration, verdict=verdict(calibration))

@@ -8,8 +8,7 @@ from evercal.calibration.boards.corners import BoardView, board_pose
 from evercal.calibration.calibration import Calibration
 from evercal.calibration.checks import Checks
 from evercal.calibration.fixed.corner_fit import corner_fit
-from evercal.calibration.fixed.sightings import image_uses, judged
-from evercal.calibration.fixed.still import still_pose
+from evercal.calibration.fixed.sightings import judged
 from evercal.calibration.from_map.by_points import require_spread
 from evercal.calibration.picked_points import PickedPoint
 from evercal.calibration.pose_pairs.pairs import BoardCorners
@@ -23,8 +22,10 @@ _LEAST = 4
 """Least number of points."""
 _JUDGES = 5
 """Least number of points that tell that another one is wrong."""
-_MOST_OUT = 1 / 3
-"""Largest share of points that are left out."""
+_LEAST_USED = 2 / 3
+"""Share of points that agree."""
+_TRIED = 12
+"""Number of the worst points, one of which is left out next."""
 _SIGMAS = 4.0
 """Residual of a wrong point, standard deviations, beside `_LENS_SHARE` of the image's width."""
 _LENS_SHARE = 0.005
@@ -63,35 +64,22 @@ def solve_picks(
     view = BoardView(places, np.stack([pick.pixel for pick in picks]))
     labels = [f"{pick.point} in {pick.image}" for pick in picks]
     try:
-        distance = norms(
-            board_pose(view, camera).camera_from_board.apply(places)
-        ).mean()
+        pose = board_pose(view, camera).camera_from_board
+        distance = float(norms(pose.apply(places)).mean())
         usual_px = float(np.hypot(pick_px, camera.fx * touch_m / distance))
         limit = _SIGMAS * usual_px + _LENS_SHARE * camera.width
         used = _agreeing(view, labels, camera, limit)
     except ValueError:
         raise InputError(_CONTRADICT.format(np.inf, "all of them")) from None
     corners = BoardCorners(camera, (view[used],), stated=True)
-    start = board_pose(view[used], camera).camera_from_board
-    fit = corner_fit(corners, SE3.stack([start]), usual_px)
+    fit = corner_fit(corners, usual_px)
     fit.require_one_pose()
     # Of the touches a part is the tool's, which all share.
     tool = UncertainPose(SE3.identity(), np.diag([touch_m**2] * 3 + [1e-8] * 3))
-    pose = tool @ still_pose(fit).inverse()
-    miss = norms(view.pixels - fit.lens.camera.project(fit.poses[0].apply(places)))
-    misses = 1000 * miss * distance / camera.fx
-    checks = Checks(
-        residual_mm=float(np.sqrt((misses[used] ** 2).mean())),
-        residual_deg=0.0,
-        target_m=float(distance),
-    )
-    images = image_uses(labels, used, misses)
-    return judged(
-        Calibration(
-            "eye_to_hand", pose.pose, pose.covariance, images=images, checks=checks
-        ),
-        fit,
-    )
+    misses = norms(view.pixels - fit.camera.project(fit.poses[0].apply(places)))
+    apart = np.outer(misses, [distance / camera.fx, 0])
+    checks = Checks(target_m=distance)
+    return judged(tool @ fit.first.inverse(), labels, used, apart, checks, fit)
 
 
 def _agreeing(
@@ -103,19 +91,13 @@ def _agreeing(
     """(k,) picks that agree with each other; those that do not are left out one by one."""
     used = np.ones(len(labels), bool)
     while True:
-        pose = board_pose(view[used], camera)
-        worst = norms(pose.residual_px).max()
-        if worst < limit_px:
+        misses = norms(board_pose(view[used], camera).residual_px)
+        if misses.max() < limit_px:
             return used
-        rows = np.flatnonzero(used)
-        out = len(labels) - len(rows)
-        if len(rows) <= _JUDGES or out + 1 > _MOST_OUT * len(labels):
-            break
-        costs = []
-        for row in rows:
-            used[row] = False
-            costs.append(board_pose(view[used], camera).squared_px)
-            used[row] = True
-        used[rows[np.argmin(costs)]] = False
-    most = np.flatnonzero(used)[norms(pose.residual_px).argmax()]
-    raise InputError(_CONTRADICT.format(worst, labels[most]))
+        rows = np.flatnonzero(used)[misses.argsort()]
+        left = len(rows) - 1
+        if left < _JUDGES or left < _LEAST_USED * len(labels):
+            raise InputError(_CONTRADICT.format(misses.max(), labels[rows[-1]]))
+        without = used & ~np.eye(len(labels), dtype=bool)[rows[-_TRIED:]]
+        costs = [board_pose(view[own], camera).squared_px for own in without]
+        used = without[np.argmin(costs)]
