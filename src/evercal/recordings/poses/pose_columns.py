@@ -121,12 +121,12 @@ _ORDERS = (
     "tum",
 )
 _Q = "q,q_,quat,quat_,quaternion_,orientation_,rotation_,q_rs_"
-_R = "r,r_,rot_,rotation_"
+_R = "r,r_,rot_,rotation_,ori_"
 HEADERS = {
     "position": ColumnGroup(
         ",t,t_,p,p_,pos_,position_,translation_,tvec_,p_rs_r_", "xyz"
     ),
-    "quaternion": ColumnGroup(_Q, "wxyz", ("wxyz", *_ORDERS), axes="wxyz"),
+    "quaternion": ColumnGroup(f"{_Q},{_R}", "wxyz", ("wxyz", *_ORDERS), axes="wxyz"),
     "rotation vector": ColumnGroup(
         "rotvec_,rvec_,rotation_vector_", "xyz", ("ur",), axes="-"
     ),
@@ -153,6 +153,9 @@ HEADERS = {
         ("rpy", "yaskawa", "staubli", "fanuc", "kuka"),
         ("rpy:rad", "rpy:deg"),
         "xyz",
+    ),
+    "alpha beta gamma": ColumnGroup(
+        "", ("alpha", "beta", "gamma"), _ANGLES, ("staubli", "yaskawa"), "xyz"
     ),
     "A B C": ColumnGroup("", "abc", ("kuka",), ("kuka", "mitsubishi")),
     "U V W": ColumnGroup("", "uvw", ("kuka",), ("epson",)),
@@ -329,6 +332,10 @@ def _defined(groups: _Groups, words: Sequence[str]) -> tuple[str, str, Sequence[
         key = unclear[0]
         columns = ", ".join(np.array(words, object)[groups[key]])
         problem = f"columns {columns} do not define a rotation"
-        return "", problem, HEADERS[key].ask
+        offers = HEADERS[key].ask
+        _, unit = name_and_unit(words[groups[key][0]])
+        if unit == "deg":  # robots state rotation vectors in radians
+            offers = [name for name in offers if name != "ur"]
+        return "", problem, offers
     problem = f"the columns {few(words, most=8)} name no known pose"
     return "", problem, USUAL

@@ -67,7 +67,15 @@ _ROLES = {
     False: re.compile(rf"(?:{_CAMERA})(?:_(.+))?|(.+)_(?:{_CAMERA})"),
 }
 """Keys of the robot or of the camera, with the rest of the key after or before."""
-_INVERSE = re.compile("base2gripper|gripper_from_base|cam2target|board_from_camera")
+_ON_ARM = "gripper|hand|eef?|tool0?|tcp|flange|end_effector|effector|wrist|tip"
+_BASE = "base|base_link|world|robot"
+_BOARD = "board|target|marker|tag|object|pattern"
+_SENSOR = "cam|camera|sensor|optical"
+_INVERSES = {
+    True: ((f"{_ON_ARM}|{_SENSOR}", _BASE), (_BOARD, _SENSOR)),
+    False: ((_ON_ARM, _BASE), (f"{_BOARD}|world", _SENSOR)),
+}
+"""Words of what moves and of what its pose is stated in, of the robot or of the camera."""
 _LISTS = {
     "translation_m": ("x_m", "y_m", "z_m"),
     "xyz": ("x", "y", "z"),
@@ -203,7 +211,9 @@ def _keys_of_images(data: Columns) -> list[str]:
         return [*data]
     words = {re.sub(r"\d+", "", key) for key in data}
     is_numbered = len(words) == 1 and words.isdisjoint(data)
-    if is_numbered:
+    # The number of gripper2base counts nothing: it holds a list of matrices.
+    many = max(map(len, map(nested_shape, data.values())), default=0) > 2
+    if is_numbered and not many:
         return sorted(data, key=natural_key)
     return []
 
@@ -234,9 +244,10 @@ def _of_role(columns: Columns, given: Given, robot: bool) -> Columns:
     keys = []
     of_role: JsonObject = {}
     others: JsonObject = {}
+    inverse = [key for key in columns if _is_inverse(key, robot)]
     for key, value in columns.items():
         match = _ROLES[robot].fullmatch(key)
-        if match:
+        if match and key not in inverse:
             keys.append(key)
             of_role[match[1] or match[2] or "pose"] = value
         elif not _ROLES[not robot].fullmatch(key):
@@ -245,12 +256,28 @@ def _of_role(columns: Columns, given: Given, robot: bool) -> Columns:
         if len(of_role) < len(keys):
             raise _unclear(keys, columns)
         return others | of_role
-    inverse = [key for key in columns if _INVERSE.search(key)]
     if inverse and not (given and given.has("inverse")):
+        right = "base_from_gripper" if robot else "camera_from_board"
         raise ConventionError(
-            f"{inverse[0]} is the inverse of the pose", "such as matrix:inverse"
+            f"{inverse[0]} is the inverse of the pose by its name; call it {right} if it is not",
+            "such as matrix:inverse",
         )
     return columns
+
+
+def _is_inverse(key: str, robot: bool) -> bool:
+    """Whether a key says that its poses are those of the base in what moves."""
+    for moved, fixed in _INVERSES[robot]:
+        forms = [
+            rf"(?<![a-z])({moved})_from_({fixed})",
+            rf"(?<![a-z])({fixed})(2|_2_|_to_|_in_)({moved})",
+            rf"(?<![a-z])({moved})_?T_?({fixed})",
+            rf"(?<![a-z])[THX]_({moved})_({fixed})",
+        ]
+        if re.search(rf"({'|'.join(forms)})(?![a-z])", key, re.IGNORECASE):
+            return True
+    # Letters, as in T_e_b.
+    return re.fullmatch("[THX]_[eghf]_[bw]|[eghf]_?T_?[bw]", key) is not None
 
 
 def _of_arrays(columns: Columns, given: Given, plural: bool) -> PoseTable | None:

@@ -1,7 +1,8 @@
 """Poses as robots and programs print them, numpy's and Python's lists, as lines of a table.
 
-Notations are tf2_echo of ROS, RAPID of ABB, LS of FANUC, URScript, KRL of KUKA, HALCON's .dat,
-Redwood's .log (Open3D), autolab_core's .tf and prints, and prints of SAPIEN, Pinocchio and Blender.
+Notations are tf2_echo of ROS, RAPID of ABB, LS of FANUC, URScript, KRL of KUKA, posx of Doosan,
+HALCON's .dat, Redwood's .log (Open3D), autolab_core's .tf and prints, and prints of SAPIEN,
+Pinocchio and Blender.
 """
 
 import re
@@ -32,6 +33,11 @@ _NOTATIONS = {
         rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?\{{([^\[\]{{}}]*\bX\s+[-+.\d][^\[\]{{}}]*)\}}()',
         "X,Y,Z,A,B,C",
         "kuka",
+    ),
+    "posx(": (
+        rf'(?:(?<!{_WORD})({_WORD}++)[\s=,;:"]+)?posx\(([^()]*)\)()',
+        "x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg",
+        "moving_zyz",
     ),
     "f 0": (
         r"()(?m:^)f 0\nr ([^\n]*)\nt ([^\n]*)",
