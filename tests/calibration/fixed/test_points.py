@@ -195,6 +195,12 @@ def test_contradictory_picks_are_refused(change: Changed, message: str) -> None:
         picked(9, 2, change)
 
 
+@pytest.mark.parametrize("seed", [3, 8, 12, 14])
+def test_picks_that_agree_only_by_leaving_out_are_refused(seed: int) -> None:
+    with pytest.raises(InputError, match="contradict"):
+        picked(9, seed, mirrored)
+
+
 @pytest.mark.parametrize(
     ("text", "names"),
     [

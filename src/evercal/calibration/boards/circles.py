@@ -48,14 +48,13 @@ def find_circles(grey: Image, board: Board) -> Detection:
         if not found:
             continue
         grid = np.reshape(centres, (board.rows, board.columns, 2)).astype(float)
-        for step in ((1, 1), (1, -1), (-1, -1), (-1, 1)):
-            pixels = grid[:: step[0], :: step[1]].reshape(-1, 2)
+        for down, right in ((1, 1), (1, -1), (-1, -1), (-1, 1)):
+            pixels = grid[::down, ::right].reshape(-1, 2)
             plane, _ = cv2.findHomography(pixels, points[:, :2])
             if plane is None or np.linalg.det(plane) < 0:
                 continue
             plane = np.asarray(plane, float)
-            on_board = cv2.perspectiveTransform(pixels[None], plane)[0]
-            on_board = np.asarray(on_board, float)
+            on_board = _moved(pixels, plane)
             away = np.abs(on_board - points[:, :2]).max() / board.size_m
             if away < _MAX_MISFIT:
                 return BoardView(points, _centres(image, on_board, plane))
@@ -76,13 +75,16 @@ def _centres(image: Image, on_board: Array, plane: Array) -> Array:
     window = near * np.stack(np.meshgrid(_WINDOW, _WINDOW), -1).reshape(-1, 2)
     window = window[norms(window) < near / 2]
     for _ in range(_ROUNDS):
-        at = on_board[:, None] + window
-        pixels = cv2.perspectiveTransform(at, to_image)
-        u, v = np.moveaxis(np.asarray(pixels, np.float32), -1, 0)
+        pixels = _moved((on_board[:, None] + window).reshape(-1, 2), to_image)
+        u, v = pixels.astype(np.float32).T.reshape(2, -1, len(window))
         values = np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR), float)
         dark, bright = np.percentile(values, _LEVELS, axis=1)[..., None]
         share = (bright - values) / (bright - dark)
         weight = np.clip(share, _EDGE, 1 - _EDGE) - _EDGE
-        moved = (weight[..., None] * window).sum(1) / weight.sum(1)[:, None]
-        on_board = on_board + moved
-    return np.asarray(cv2.perspectiveTransform(on_board[None], to_image)[0], float)
+        on_board = on_board + weight @ window / weight.sum(1)[:, None]
+    return _moved(on_board, to_image)
+
+
+def _moved(points: Array, plane: Array) -> Array:
+    """Points (k, 2) after a homography."""
+    return np.asarray(cv2.perspectiveTransform(points[None], plane)[0], float)

@@ -171,20 +171,19 @@ def layout_readings(tags: dict[int, Tag], side_m: float) -> Iterator[Corners]:
                 for number, own in corners.items()
             }
         return
-    turns = {
-        number: _rotations(tag.get("rotation", [])) for number, tag in tags.items()
-    }
+    turns = {k: _rotations(tag.get("rotation")) for k, tag in tags.items()}
     ways = range(min(map(len, turns.values())))
     for unit, way, axes in product(_UNITS, ways, Rotation.create_group("O")):
+        printed = axes.apply(square(1.0))
         layout = {}
         for number, tag in tags.items():
-            printed = axes.apply(square(1.0)) * tag.get("size", side_m)
             middle = unit * np.array(tag.get("position", [0, 0, 0]))
-            layout[number] = middle + turns[number][way].apply(printed)
+            arms = turns[number][way].apply(printed)
+            layout[number] = middle + tag.get("size", side_m) * arms
         yield layout
 
 
-def _rotations(numbers: list[float]) -> list[Rotation]:
+def _rotations(numbers: list[float] | None) -> list[Rotation]:
     """What a rotation may be."""
     if not numbers:
         return [Rotation.identity()]

@@ -11,7 +11,7 @@ from evercal.calibration.boards.board_poses import (
 )
 from evercal.calibration.boards.intrinsics import calibrate_camera
 from evercal.errors import InputError
-from evercal.geometry import SE3, Camera, norms
+from evercal.geometry import SE3, Camera, deviations, norms
 from evercal.typing import JsonObject
 
 _WORSE = 1.3
@@ -118,8 +118,7 @@ def _widened(
     pose = image.camera_from_board
     if not pose or not other:
         return image
-    shift = other.translation_m - pose.translation_m
-    away = np.r_[shift, (pose.inverse() @ other).log()[3:]]
+    away = deviations(SE3.stack([other]), pose)[0]
     return replace(image, covariance=image.covariance + np.outer(away, away))
 
 

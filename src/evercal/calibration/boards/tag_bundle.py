@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from evercal.calibration.boards.corners import board_pose, lens_vector
 from evercal.calibration.boards.intrinsics import LensPrior, moved_camera
@@ -49,10 +48,9 @@ def adjusted(
     for markers in found[:: -(-len(found) // _MOST_IMAGES)]:
         view = view_of(markers, start.corners)
         if view:
-            pixels = dict(zip(markers.ids.tolist(), markers.corners, strict=True))
-            for k, number in enumerate(numbers):
-                if number in pixels:
-                    seen.append((len(poses), k, pixels[number]))
+            for number, own in zip(markers.ids.tolist(), markers.corners, strict=True):
+                if number in numbers:
+                    seen.append((len(poses), numbers.index(number), own))
             poses.append(board_pose(view, camera).camera_from_board)
     image, tag, pixels = map(np.array, zip(*seen, strict=True))
     start_poses = SE3.stack(poses)
@@ -93,6 +91,5 @@ def adjusted(
 def _moved_tags(corners: Array, change: Array) -> Array:
     """Corners (t, 4, 3) of tags after a (t, 7) change."""
     middle = corners.mean(1, keepdims=True)
-    turn = Rotation.from_rotvec(change[:, 3:6]).as_matrix()
-    arms = (corners - middle) @ turn.transpose(0, 2, 1)
-    return middle + change[:, None, :3] + arms * np.exp(change[:, None, 6:])
+    arms = (corners - middle) * np.exp(change[:, None, 6:])
+    return middle + SE3.exp(change[:, :6])[:, None].apply(arms)

@@ -26,6 +26,8 @@ _LEAST_USED = 2 / 3
 """Share of points that agree."""
 _TRIED = 12
 """Number of the worst points, one of which is left out next."""
+_MOST_NOISE = 2.0
+"""Noise of the picks that agree, parts of the stated one, where others were left out."""
 _SIGMAS = 4.0
 """Residual of a wrong point, standard deviations, beside `_LENS_SHARE` of the image's width."""
 _LENS_SHARE = 0.005
@@ -77,6 +79,8 @@ def solve_picks(
     # Of the touches a part is the tool's, which all share.
     tool = UncertainPose(SE3.identity(), np.diag([touch_m**2] * 3 + [1e-8] * 3))
     misses = norms(view.pixels - fit.camera.project(fit.poses[0].apply(places)))
+    if not used.all() and fit.sigma_px > _MOST_NOISE * usual_px:
+        raise InputError(_CONTRADICT.format(misses.max(), labels[misses.argmax()]))
     apart = np.outer(misses, [distance / camera.fx, 0])
     checks = Checks(target_m=distance)
     return judged(tool @ fit.first.inverse(), labels, used, apart, checks, fit)

@@ -39,19 +39,20 @@ def by_distances(
     """
     unknown = {name: np.zeros(3) for _, _, pixels in picks for name in pixels}
     images = located_picks(localizer, scene, unknown, picks)
-    places = triangulated(images)
+    places = {name: point for name, (point, _) in triangulated(images).items()}
     logarithms = []
     variances = []
     # Errors of poses by the intrinsics are common to all images.
     by_poses = 2 * max(np.trace(image.covariance[:3, :3]) / 3 for image in images)
-    for (first, second), metres in distances.items():
-        for name in (first, second):
+    for ends, metres in distances.items():
+        first, second = ends
+        for name in ends:
             if name not in places:
                 raise InputError(
                     f"point {name} was not picked in two located images from different places;"
                     f" those are {', '.join(places) or 'none'}"
                 )
-        between = places[second][0] - places[first][0]
+        between = places[second] - places[first]
         length = float(np.linalg.norm(between))
         if not metres > 0 or not length > 0:
             raise InputError(
@@ -59,11 +60,9 @@ def by_distances(
                 " above 0"
             )
         logarithms.append(np.log(metres / length))
-        spread = [
-            _covariance(images, name, places[name][0]) for name in (first, second)
-        ]
+        own = sum(_covariance(images, name, places[name]) for name in ends)
         along = between / length
-        variances.append(float(along @ sum(spread) @ along + by_poses) / length**2)
+        variances.append((along @ own @ along + by_poses) / length**2)
     weight = 1 / np.array(variances)
     mean = float(np.average(logarithms, weights=weight))
     off = np.abs(np.array(logarithms) - mean)
