@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from evercal.geometry import spread
-from evercal.recordings.frame import Frame, Recording
+from evercal.recordings.frame import Recording
 from evercal.recordings.masks import PartOfImage
 from evercal.recordings.repeated_patches import reduced_grey, repeats
 from evercal.typing import BoolArray, Image
@@ -55,7 +55,8 @@ def without_fixed_pixels(recording: Recording) -> tuple[Recording, float]:
         if fixed.any():
             most = max(most, float(fixed.mean()))
             for i in rows:
-                train[i] = _without(train[i], ~fixed)
+                image = PartOfImage(train[i].image, ~fixed)
+                train[i] = replace(train[i], image=image)
     return replace(recording, train=tuple(train)), most
 
 
@@ -75,7 +76,3 @@ def fixed_pixels(greys: Sequence[Image]) -> BoolArray:
     if closed.mean() < LEAST:
         return none
     return cv2.dilate(closed, np.ones((MARGIN_PX, MARGIN_PX), np.uint8)) > 0
-
-
-def _without(frame: Frame, keep: BoolArray) -> Frame:
-    return replace(frame, image=PartOfImage(frame.image, keep))

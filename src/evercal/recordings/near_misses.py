@@ -33,22 +33,17 @@ _WITHOUT = "base_from_gripper.csv, joints.csv or base_from_camera.csv"
 def what_it_lacks(root: Path) -> str:
     """What a folder lacks to be a recording, or what a file is."""
     if root.is_file():
-        return _kind_of(root, "a file, not a folder, and no bag")
+        return _KINDS.get(root.suffix.lower(), "a file, not a folder, and no bag")
     for folder in image_folders(root):
         return _beside(root, folder)
     for path in sorted(root.glob("*")):
-        kind = _kind_of(path)
-        if kind and not kind.startswith("no images"):
+        kind = _KINDS.get(path.suffix.lower(), "no images")
+        if not kind.startswith("no images"):
             return f"no images; {path.name} is {kind}"
     return (
         "no known scene format, no images; give a bag, or a folder that holds images and"
         f" {_WITHOUT}, scene.json, transforms.json, sparse/0 or meta/info.json"
     )
-
-
-def _kind_of(file: Path, unknown: str = "") -> str:
-    """What a file is, by its ending."""
-    return _KINDS.get(file.suffix.lower(), unknown)
 
 
 def _beside(root: Path, folder: Path) -> str:

@@ -23,6 +23,7 @@ from evercal.recordings.poses.conventions import (
     pose_convention,
     poses_from_numbers,
 )
+from evercal.recordings.repeated_patches import reduced_grey
 from evercal.typing import Array, Float32Array
 
 PAIRS = 16
@@ -201,7 +202,7 @@ def measured_motion(first: Frame, second: Frame) -> SE3 | None:
     first_rows, second_rows = np.transpose(rows)
     a = first_rays[first_rows]
     b = second_rays[second_rows]
-    scale = min(1.0, LONG_SIDE / max(first.camera.width, 1))
+    scale = min(1.0, LONG_SIDE / max(first.camera.size))
     threshold = EPIPOLAR_PX / (first.camera.fx * scale)
     cv2.setRNGSeed(0)
     matrix, inliers = cv2.findEssentialMat(
@@ -216,14 +217,9 @@ def measured_motion(first: Frame, second: Frame) -> SE3 | None:
 
 def _features(frame: Frame) -> tuple[Array, Float32Array]:
     """(n, 2) points of the plane z = 1, and their SIFT descriptors."""
-    image = cv2.cvtColor(frame.read_image(), cv2.COLOR_RGB2GRAY)
-    camera = frame.camera
-    scale = LONG_SIDE / max(camera.size)
-    if scale < 1:
-        width = round(camera.width * scale)
-        height = round(camera.height * scale)
-        camera = camera.resized(width, height)
-        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    image = reduced_grey(frame.read_image(), LONG_SIDE)
+    height, width = image.shape
+    camera = frame.camera.resized(width, height)
     sift = cv2.SIFT_create(1500)  # pyright: ignore[reportAttributeAccessIssue]
     points, descriptors = sift.detectAndCompute(image, None)
     if descriptors is None:

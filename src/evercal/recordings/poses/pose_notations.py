@@ -8,7 +8,7 @@ Pinocchio and Blender.
 import re
 
 from evercal.recordings.poses.conventions import Given, pose_convention
-from evercal.recordings.poses.row_files import is_number
+from evercal.recordings.poses.row_files import is_number, separator_of
 
 _WORD = r'[^\s\[\](){}=,;:"]'
 _MATRIX = ",".join(f"m{row}{column}" for row in range(4) for column in range(4))
@@ -153,11 +153,7 @@ def _without_lists(lines: list[str]) -> list[str]:
     lines = [*filter(None, (_TITLE.sub("", line) for line in lines))]
     if not lines:
         return lines
-    first = lines[0]
-    separator = " "
-    for character in "\t,;":
-        if character in first:
-            separator = character
+    separator = separator_of(lines[0])
     lines = [_LABEL.sub(rf"\1{separator}", line) for line in lines]
     if not re.search(r"((?<!\w)\[|[({])\s*[-+.\d]", lines[0]):
         return lines

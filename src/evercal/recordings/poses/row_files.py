@@ -112,7 +112,7 @@ def table_cells(lines: Sequence[str]) -> Cells:
     the comma may be a decimal point.
     """
     first = next((line for line in lines if line.strip()), "")
-    separator = _separator(first)
+    separator = separator_of(first)
     columns = first.count(separator) + 1
     if separator == " ":
         columns = len(first.split())
@@ -135,7 +135,8 @@ def _has_point(cell: str) -> bool:
     return "." in cell and is_number(cell)
 
 
-def _separator(line: str) -> str:
+def separator_of(line: str) -> str:
+    """What separates the cells of a line of text."""
     words = line.split()
     with_commas = [word for word in words if "," in word]
     separators = ";,\t"
