@@ -126,6 +126,7 @@ RIGHT_INPUT = (
     },
     {"robot": {"dof": 6, "home": [0.1] * 6}, "gripper": {"width_m": 0.08}, "seed": 3},
     {"optimal_camera_matrix": np.eye(3).tolist(), "ret": 0.3, "rvecs": [[1, 2, 3]]},
+    {"fov": 60, "focal": 3.6, "sensor_width": 5},
     {"P1": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "new_camera_matrix": MATRIX},
 )
 

@@ -58,8 +58,6 @@ division: divisionundistortion
 _PINHOLE = COEFFICIENTS["pinhole"]
 _OF_ROS = {"rectificationmatrix", "header"}
 """Names of fields that only ROS writes."""
-_RECTIFIED = {"p", "r"}
-"""Names of the matrices of ROS for rectified images."""
 _KNOWN = {
     *FIELDS,
     *MODEL_NAMES,
@@ -81,7 +79,7 @@ def named_fields(data: Record) -> JsonObject:
     fields = {}
     for key, value in data.items():
         name = field_name(key)
-        if name == "distortion_coefficients" and _is_word(value):
+        if name == "distortion_coefficients" and isinstance(value, str):
             name = "distortionmodel"  # as RealSense prints it
         elif name in _PINHOLE and is_array(value):
             continue  # P1 and P2 of a stereo camera
@@ -90,10 +88,6 @@ def named_fields(data: Record) -> JsonObject:
         keys[name] = key
         fields[name] = value
     return fields
-
-
-def _is_word(value: object) -> bool:
-    return isinstance(value, str) and value.lower() not in ("none", "null", "")
 
 
 def camera_of(data: Record, size: Size | None) -> Camera:
@@ -108,8 +102,7 @@ def camera_of(data: Record, size: Size | None) -> Camera:
             raise ValueError(
                 f"the image is a cut-out ({key} {value}); give the whole image's camera_info"
             )
-    plain = {*map(plain_name, data)}
-    is_ros = bool(plain & _OF_ROS) or plain >= _RECTIFIED
+    is_ros = not _OF_ROS.isdisjoint(map(plain_name, data))
     if "lensmodel" in fields:  # of mrcal
         numbers = numbers_of(fields.get("camera_matrix"), "intrinsics")
         fields["camera_matrix"] = numbers[:4]
@@ -206,7 +199,7 @@ def _distortion(fields: Record, model: str) -> Floats | None:
         raise ValueError(f"{key} and {stated[0]} are both stated; keep one of them")
     stated = [name for name in names if name in fields]
     if key in fields:
-        if str(fields[key]).lower() in ("none", "null"):
+        if fields[key] is None:
             return ()
         numbers = numbers_of(fields[key], key)
     elif stated:
@@ -236,7 +229,6 @@ def _refuse_other_models(models: Record, distortion: Floats) -> None:
 
 def _matrix(fields: Record, data: Record) -> Array:
     """(3, 3) intrinsic matrix."""
-    names = ("fx", "fy", "cx", "cy")
     if "camera_matrix" in fields:
         numbers = numbers_of(fields["camera_matrix"], "camera_matrix")
         # As Kalibr writes it; other orders differ in the first two.
@@ -250,15 +242,15 @@ def _matrix(fields: Record, data: Record) -> Array:
         if matrix[2, :2].any() and not matrix[:2, 2].any():
             return matrix.T  # Open3D writes it column after column.
         return matrix
-    missing = [name for name in names if name not in fields]
-    if missing:
-        problem = "'camera_matrix' is missing"
-        if len(missing) < len(names):
-            problem = f"camera {missing[0]!r} is missing"
-        stated = _keys(data) or "nothing"
-        raise ValueError(f"{problem}, there is {stated}; {EXPECTED}")
-    values = [fields[name] for name in names]
-    return _matrix_of(*numbers_of(values, "fx, fy, cx, cy", 4))
+    names = ("fx", "fy", "cx", "cy")
+    stated = [fields[name] for name in names if name in fields]
+    if len(stated) < len(names):
+        missing = [name for name in names if name not in fields]
+        problem = f"camera {missing[0]!r} is missing"
+        if not stated:
+            problem = "'camera_matrix' is missing"
+        raise ValueError(f"{problem}, there is {_keys(data) or 'nothing'}; {EXPECTED}")
+    return _matrix_of(*numbers_of(stated, "fx, fy, cx, cy", 4))
 
 
 def _matrix_of(fx: float, fy: float, cx: float, cy: float) -> Array:
@@ -338,10 +330,7 @@ def off_centre(camera: Camera) -> float:
 def refuse_misfit(camera: Camera) -> None:
     """Refuse short focal lengths, and principal points outside of the image."""
     focal = min(camera.fx, camera.fy)
-    plausible = focal >= camera.width / 10
-    inside_x = 0 <= camera.cx <= camera.width
-    inside_y = 0 <= camera.cy <= camera.height
-    if plausible and inside_x and inside_y:
+    if focal >= camera.width / 10 and off_centre(camera) <= 0.5:
         return
     numbers = f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}"
     raise ValueError(

@@ -84,23 +84,21 @@ def camera_from_fields(
     entries = cameras_of(data)
     if not entries:
         return camera_of({str(key): value for key, value in data.items()}, size)
-    places = [*entries]
-    if name:
-        exact = [place for place in places if place == name]
-        within = [place for place in places if name.lower() in place.lower()]
-        places = exact or within
-        if not places:
-            raise ValueError(f"no camera {name!r}, only {few([*entries], most=8)}")
+    places = [place for place in entries if name.lower() in place.lower()]
+    if name in entries:
+        places = [name]
+    if not places:
+        raise ValueError(f"no camera {name!r}, only {few([*entries], most=8)}")
     cameras: dict[str, Camera] = {}
-    fitting: dict[Camera, str] = {}
+    fitting = []
     for place in places:
         entry = entries[place]
         with naming(place) if len(entries) > 1 else nullcontext():
             camera = camera_of(entry, size)
         cameras[place] = camera
         if camera.size == size and (states_size(entry) or off_centre(camera) < CENTRAL):
-            fitting[camera] = place
-    choice = fitting or {camera: place for place, camera in cameras.items()}
+            fitting.append(place)
+    choice = {cameras[place]: place for place in fitting or places}
     first = next(iter(choice))
     if len(choice) == 1:
         refuse_misfit(first)

@@ -67,7 +67,7 @@ _HARMLESS = re.compile(
     r"|orbextract|viewer|system|accel|gyro|bias|walk|mocap|vignette|batch|unit|housing|^[rsp]rect|rectific|corner"
     r"|^t$|^pos|^rot$|euler|axes|axis|focus|fstop|near|far|clip|socket|firmware|port|seed|quality|channels|bits|buffer|cost"
     r"|weight|speed|robot|joint|gripper|world|origin|name|^step|^bounds|limit|threshold|light|ambient|bright|white"
-    r"|from|xyz|rpy|hand|tool|flange|mount|initial|optimal|^ret|^fw|^t[a-z]*(cam|imu|base|body)|^tbs$"
+    r"|^sensor(width|height|size)$|from|xyz|rpy|hand|tool|flange|mount|initial|optimal|^ret|^fw|^t[a-z]*(cam|imu|base|body)|^tbs$"
 )
 """Names of numbers that do not change where a point lies in the image."""
 LENS = re.compile(
