@@ -59,9 +59,14 @@ class _Value(NamedTuple):
 
 def cameras_of(data: object) -> dict[str, JsonObject]:
     """Fields of all cameras by the names of their blocks."""
-    values = [_placed(path, value) for path, value in _leaves(data, "")]
+    values = []
     homes: dict[Any, list[_Value]] = {}
-    for value in values:
+    for path, entry in _leaves(data, ""):
+        block, _, leaf = path.rpartition(".")
+        field, words = _role(leaf, entry)
+        told = words | _told(_WORD.findall(block))
+        value = _Value(path, (block, words), field, told, entry)
+        values.append(value)
         homes.setdefault(value.home, []).append(value)
     cameras = {}
     views = {}
@@ -112,13 +117,6 @@ def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
         yield path, value
     for name, entry in parts.items():
         yield from _leaves(entry, name)
-
-
-def _placed(path: str, value: Any) -> _Value:
-    block, _, leaf = path.rpartition(".")
-    field, words = _role(leaf, value)
-    told = words | _told(_WORD.findall(block))
-    return _Value(path, (block, words), field, told, value)
 
 
 def _role(key: str, value: Any) -> tuple[str, frozenset[str]]:

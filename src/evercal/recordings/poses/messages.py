@@ -20,7 +20,11 @@ def entries_of_messages(entries: list[Any], given: Given) -> list[Any]:
 
     Of several tags, those with the stated number. ValueError: it is not clear which.
     """
-    keys = {key for entry in entries for key in entry if _is_list(entry[key])}
+    keys = set()
+    for entry in entries:
+        for key, value in entry.items():
+            if isinstance(value, list) and value and isinstance(value[0], Mapping):
+                keys.add(key)
     if len(keys) != 1:
         return entries
     (key,) = keys
@@ -47,8 +51,3 @@ def entries_of_messages(entries: list[Any], given: Given) -> list[Any]:
         problem = f"it holds poses of the tags {few(tags)}"
         raise ConventionError(problem, "of one, such as xyzw:tag4 for tag 4")
     return rows
-
-
-def _is_list(value: object) -> bool:
-    """Whether a value is a list of objects."""
-    return isinstance(value, list) and bool(value) and isinstance(value[0], Mapping)

@@ -170,11 +170,26 @@ def _aside(motions: PairMotions, between: SE3) -> float:
 
 
 def measured_motions(frames: Sequence[Frame], poses: SE3) -> PairMotions:
-    """Motions of the camera between the pairs of frames that match."""
+    """Motions of the camera between the pairs of frames that match.
+
+    Frames spread over the recording, each with a later one that is rotated enough. Large rotations
+    separate the readings best, but with nonsensical angles only near frames are certain to match.
+    Every second pair is therefore the nearest one.
+    """
+    rotation = poses.rotation
     ends = []
     motions = [SE3.identity()]
-    for first, second in _pairs(poses):
-        motion = measured_motion(frames[first], frames[second])
+    for i, first in enumerate(spread(len(poses) - 1, PAIRS).tolist()):
+        end = min(first + 1 + MAX_FRAMES_APART, len(poses))
+        difference = rotation[first].inv() * rotation[first + 1 : end]
+        degrees = np.rad2deg(difference.magnitude())
+        best = np.argmax(degrees > MIN_ROTATION_DEG)
+        if i % 2:
+            best = np.argmin(np.abs(degrees - BEST_ROTATION_DEG))
+        second = first + 1 + int(best)
+        motion = None
+        if degrees[best] > MIN_ROTATION_DEG:
+            motion = measured_motion(frames[first], frames[second])
         if motion:
             ends.append((first, second))
             motions.append(motion)
@@ -228,28 +243,6 @@ def _features(frame: Frame) -> tuple[Array, Float32Array]:
     rays = camera.unproject(pixels)[:, :2]
     valid = np.isfinite(rays).all(1)
     return rays[valid], descriptors[valid]
-
-
-def _pairs(poses: SE3) -> list[tuple[int, int]]:
-    """Frames spread over the recording, each with a later one that is rotated enough.
-
-    Large rotations separate the readings best, but with nonsensical angles only near frames are
-    certain to match. Every second pair is therefore the nearest one.
-    """
-    rotation = poses.rotation
-    pairs = []
-    for i, first in enumerate(spread(len(poses) - 1, PAIRS)):
-        end = min(first + 1 + MAX_FRAMES_APART, len(poses))
-        later = np.arange(first + 1, end)
-        difference = rotation[first].inv() * rotation[later]
-        degrees = np.rad2deg(difference.magnitude())
-        if i % 2:
-            best = np.argmin(np.abs(degrees - BEST_ROTATION_DEG))
-        else:
-            best = np.argmax(degrees > MIN_ROTATION_DEG)
-        if degrees[best] > MIN_ROTATION_DEG:
-            pairs.append((int(first), int(later[best])))
-    return pairs
 
 
 def _error_deg(measured: Array, stated: Array) -> float:
