@@ -100,8 +100,12 @@ def joint_search(test: JointTest) -> JointVerdict:
     tried = _bases(test)
     found: list[Explained] = []
     for most in range(1, _ROUNDS + 2):
-        tried, readings = _best(test, tried)
-        for reading in readings:
+        rows = np.argsort(test.costs(tried, _WIDE), kind="stable")[:_REFINED]
+        tried = tried[rows]
+        best = test.refined(test.refined(tried, _WIDE), _CLOSE)
+        # Some become alike.
+        _, rows = np.unique(np.round(best, 2), axis=0, return_index=True)
+        for reading in best[rows]:
             one = _judged(test, reading)
             if one.cost < limit and one.error_deg < _FOUND_DEG:
                 found.append(one)
@@ -110,7 +114,7 @@ def joint_search(test: JointTest) -> JointVerdict:
         ]
         if min(least, default=most + 1) <= most:
             break
-        tried = _composed(tried, changes)
+        tried = _composed(tried[rows], changes)
     return JointVerdict(stated, _simplest(found))
 
 
@@ -146,18 +150,6 @@ def _judged(test: JointTest, reading: Array) -> Explained:
         cost,
         mistakes,
     )
-
-
-def _best(test: JointTest, readings: Array) -> tuple[Array, Array]:
-    """The best readings, and the same refined, without those that become alike."""
-    rows = np.argsort(test.costs(readings, _WIDE), kind="stable")[:_REFINED]
-    best = test.refined(test.refined(readings[rows], _WIDE), _CLOSE)
-    _, first = np.unique(
-        np.round(best, 2),
-        axis=0,
-        return_index=True,
-    )
-    return readings[rows[first]], best[first]
 
 
 def _same(arm: Arm) -> Array:

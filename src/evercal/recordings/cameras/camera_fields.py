@@ -170,7 +170,7 @@ def _of_radial_model(kind: str, fields: Record, size: tuple[Any, Any]) -> Camera
         if fields.get(name):
             own = fields[name] if is_array(fields[name]) else [fields[name]]
             distortion += numbers_of(own, name)
-    if kind == "fov" and "fx" not in fields:
+    if len(numbers) < len(names):
         numbers = [*distortion, *numbers]
         distortion = []
     if len(numbers) != len(names) or any(distortion):
@@ -263,8 +263,6 @@ def _size(fields: Record, data: Record, size: Size | None) -> tuple[Any, Any]:
     stated = fields.get("image_size")
     if not missing:
         stated = [fields["image_width"], fields["image_height"]]
-    elif isinstance(stated, Mapping):
-        return _size(named_fields(stated), stated, None)
     elif not isinstance(stated, list | tuple):  # a number called `size` is not one
         stated = size
         if len(missing) == 1:
@@ -295,7 +293,7 @@ def _refuse_unknown(data: Record, known: Strings = ()) -> None:
 
 def _is_matrix(key: str, value: object, count: int) -> bool:
     """Whether numbers are a 3x3 or 4x4 matrix, or P of ROS, or another one in rows."""
-    if is_array(value) and LENS.search(plain_name(key)):
+    if LENS.search(plain_name(key)):
         return False
     if count in (9, 16):
         return True

@@ -111,19 +111,15 @@ def without_brackets(lines: list[str], given: Given) -> tuple[list[str], Given]:
     (kind,) = kinds
     pattern, columns, *convention = _NOTATIONS[kind]
     for line in re.sub(pattern, " ", text).splitlines():
-        if _holds_numbers(line):
+        cells = [*filter(None, re.split(r"[^\w.+#-]+", line))]
+        numbers = sum(map(is_number, cells))
+        if numbers > 2 and 2 * numbers > len(cells) and ":=" not in line:
             raise ValueError(
                 f"{line.strip()[:60]!r} is beside poses in {kind}; use one notation"
             )
     if not given and convention:
         given = pose_convention(convention[0])
     return _rows(re.findall(pattern, text), columns), given
-
-
-def _holds_numbers(line: str) -> bool:
-    cells = [*filter(None, re.split(r"[^\w.+#-]+", line))]
-    numbers = sum(map(is_number, cells))
-    return numbers > 2 and 2 * numbers > len(cells) and ":=" not in line
 
 
 def _rows(poses: list[tuple[str, str, str]], columns: str) -> list[str]:
