@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from evercal.calibration.boards import tag_layout
 from evercal.calibration.boards.board import Board
+from evercal.calibration.boards.corners import board_pose
 from evercal.calibration.boards.marker_layout import Markers
 from evercal.calibration.boards.markers import find_markers
 from evercal.calibration.boards.tag_layout import Arrangement
@@ -105,6 +107,21 @@ def test_images_alone_show_a_layout(thing: str, most_mm: float, stated: bool) ->
     first = next(iter(THINGS[thing]))
     assert own[first] == pytest.approx(square(THINGS[thing][first][1]))
     assert "sides by the images" in notes[0]
+
+
+def test_tags_of_as_many_images_are_placed_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls = []
+
+    def counted(*given: object) -> object:
+        calls.append(given)
+        return board_pose(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(tag_layout, "board_pose", counted)
+    own, _ = arranged("plate")
+    assert misfit_mm(own, "plate") < 0.1
+    assert len(calls) <= 12
 
 
 def test_a_layout_that_images_contradict_is_named(tmp_path: Path) -> None:

@@ -44,6 +44,8 @@ _SCALES = np.geomspace(0.2, 5, 41)
 """Sides of a tag that are tried first, sides of the kept one."""
 _MOST_IMAGES = 60
 """Number of images that place a tag."""
+_AT_ONCE = 0.7
+"""Tags are placed together with the one of most images if they have this share of them."""
 
 
 @frozen
@@ -192,10 +194,12 @@ def _placed(
                     beside.setdefault(number, []).append((eye, corners - eye))
         if not beside:
             return placed
-        number = max(beside, key=lambda number: len(beside[number]))
-        images = beside[number][:_MOST_IMAGES]
-        sizes = [_recurring(images, scale) for scale in _SCALES]
-        placed[number] = min(sizes, key=lambda pair: pair[0])[1]
+        most = max(map(len, beside.values()))
+        for number, images in beside.items():
+            if len(images) >= _AT_ONCE * most:
+                few = images[:_MOST_IMAGES]
+                sizes = [_recurring(few, scale) for scale in _SCALES]
+                placed[number] = min(sizes, key=lambda pair: pair[0])[1]
 
 
 def _recurring(images: Sequence[ArrayPair], scale: float) -> tuple[float, Array]:
