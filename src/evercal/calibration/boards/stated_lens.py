@@ -24,6 +24,7 @@ _FREE = 9
 """Number of free intrinsics."""
 _MILLIMETRES = 20.0
 """Ratio of focal lengths above which the stated one is in millimetres."""
+_NUMBERS = "fx {0.fx:.4g} fy {0.fy:.4g} cx {0.cx:.4g} cy {0.cy:.4g}"
 _MISFIT_PX = 1.0
 """Noise of corners above which stated intrinsics are doubted where none can be estimated."""
 
@@ -38,9 +39,7 @@ def compared_lens(stated: BoardPoses) -> tuple[BoardPoses, str]:
     sigma = stated.corner_sigma_px
     views = {image.name: image.view for image in stated.detected if image.view}
     try:
-        own = calibrate_camera(
-            list(views.values()), camera.width, camera.height, camera.model
-        ).camera
+        own = calibrate_camera([*views.values()], *camera.size, camera.model).camera
     except InputError:
         if sigma < _MISFIT_PX:
             return stated, ""
@@ -61,8 +60,8 @@ def compared_lens(stated: BoardPoses) -> tuple[BoardPoses, str]:
             cause = f"{words}: "
             break
     words = (
-        f"the board contradicts the camera file: {cause}{_numbers(own)} fit, not"
-        f" {_numbers(camera)}. Corners fit to {sigma:.2f} px with it and to"
+        f"the board contradicts the camera file: {cause}{_NUMBERS.format(own)} fit, not"
+        f" {_NUMBERS.format(camera)}. Corners fit to {sigma:.2f} px with it and to"
         f" {free.corner_sigma_px:.2f} px without; it moves pixels by up to"
         f" {_moved_px(camera, own):.0f} px. Check the file, or omit `camera`"
     )
@@ -104,12 +103,6 @@ def _causes(stated: Camera, own: Camera) -> dict[str, JsonObject]:
     }
 
 
-def _numbers(camera: Camera) -> str:
-    return (
-        f"fx {camera.fx:.4g} fy {camera.fy:.4g} cx {camera.cx:.4g} cy {camera.cy:.4g}"
-    )
-
-
 def _widened(
     image: BoardImage,
     other: SE3 | None,
@@ -127,9 +120,8 @@ def _moved_px(
     estimated: Camera,
 ) -> float:
     """Largest distance between the pixels of one ray by both intrinsics."""
-    x = np.linspace(0, stated.width - 1, 9)
-    y = np.linspace(0, stated.height - 1, 9)
     # Few images leave an estimated distortion without an inverse in the corners.
-    pixels = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    shares = np.indices((9, 9)).reshape(2, -1).T / 8
+    pixels = shares * np.subtract(stated.size, 1)
     moved = stated.project(estimated.unproject(pixels)) - pixels
     return float(np.nanmax(norms(moved), initial=0.0))

@@ -163,8 +163,8 @@ def judged(
         corner_sigma_px=fit.sigma_px if fit else None,
     )
     images = []
-    for name, agrees, metres in zip(names, used.tolist(), apart[:, 0], strict=True):
-        mm = 1000 * float(metres)
+    away = (1000 * apart[:, 0]).tolist()
+    for name, agrees, mm in zip(names, used.tolist(), away, strict=True):
         reason = "" if agrees else f"is {mm:.1f} mm from where the others put it"
         images.append(ImageUse(name, agrees, reason, mm))
     calibration = Calibration(

@@ -91,7 +91,7 @@ def _covariance(images: Sequence[Picks], name: str, point: Array) -> Array:
     for image in images:
         if name in image.names:
             ray = point - image.map_from_camera.translation_m
-            depth = float(np.linalg.norm(ray))
-            across = np.eye(3) - np.outer(ray, ray) / depth**2
-            information += across * (image.camera.fx / depth / PICK_SIGMA_PX) ** 2
+            depth2 = ray @ ray
+            across = np.eye(3) - np.outer(ray, ray) / depth2
+            information += across * (image.camera.fx / PICK_SIGMA_PX) ** 2 / depth2
     return np.linalg.inv(information)
