@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from evercal.calibration.from_map.image_pairs import ImagePair, image_pairs
 from evercal.features.encoder import load_encoder
 from evercal.geometry import spread
-from evercal.geometry.motions import PairMotions
 from evercal.recordings.frame import MIN_TRAIN_FRAMES, Recording
+from evercal.recordings.poses.pose_evidence import motion_of_rays, motions_of_pairs
 from evercal.robot.arm import Arm
 from evercal.robot.joint_agreement import JointTest
 from evercal.robot.joint_search import JointVerdict, joint_search
@@ -31,35 +30,14 @@ def joint_verdict(
     arm: Arm, values: Array, pairs: Sequence[ImagePair], mount: Mount
 ) -> JointVerdict | None:
     """Compare joint values (n, k) with pairs of n images; None for too few pairs."""
-    if len(pairs) < LEAST_PAIRS:
+    motions = {}
+    for i in spread(len(pairs), PAIRS):
+        first, second = np.ascontiguousarray(pairs[i].rays[:, :, :2])
+        motions[pairs[i][:2]] = motion_of_rays(first, second, _EPIPOLAR)
+    known = motions_of_pairs(motions)
+    if len(known.ends) < LEAST_PAIRS:
         return None
-    chosen = [pairs[i] for i in spread(len(pairs), PAIRS)]
-    return joint_search(JointTest(arm, values, pair_motions(chosen), mount))
-
-
-def pair_motions(pairs: Sequence[ImagePair]) -> PairMotions:
-    """Motions of the camera by the essential matrices of pairs."""
-    import cv2
-
-    rotations = []
-    directions = []
-    for pair in pairs:
-        first, second = np.ascontiguousarray(pair.rays[:, :, :2])
-        cv2.setRNGSeed(0)
-        matrix, mask = cv2.findEssentialMat(
-            first, second, np.eye(3), cv2.RANSAC, 0.999, _EPIPOLAR
-        )
-        turn = np.eye(3)
-        shift = np.zeros((3, 1))
-        if np.shape(matrix) == (3, 3):
-            _, turn, shift, _ = cv2.recoverPose(
-                matrix, first, second, np.eye(3), mask=mask
-            )
-        rotations.append(turn.T)
-        directions.append(-(turn.T @ shift)[:, 0])
-    ends = np.array([pair[:2] for pair in pairs], np.int64)
-    turns = Rotation.from_matrix(rotations).as_rotvec()
-    return PairMotions(ends, turns, np.array(directions))
+    return joint_search(JointTest(arm, values, known, mount))
 
 
 def recorded_joints(recording: Recording, mount: Mount) -> JointVerdict | None:

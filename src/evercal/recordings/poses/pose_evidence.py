@@ -6,7 +6,7 @@ poses rotate equally. Correct gripper poses do so up to one fixed rotation betwe
 camera. Inverted poses rotate about other axes.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -177,8 +177,7 @@ def measured_motions(frames: Sequence[Frame], poses: SE3) -> PairMotions:
     Every second pair is therefore the nearest one.
     """
     rotation = poses.rotation
-    ends = []
-    motions = [SE3.identity()]
+    motions = {}
     for i, first in enumerate(spread(len(poses) - 1, PAIRS).tolist()):
         end = min(first + 1 + MAX_FRAMES_APART, len(poses))
         difference = rotation[first].inv() * rotation[first + 1 : end]
@@ -187,16 +186,19 @@ def measured_motions(frames: Sequence[Frame], poses: SE3) -> PairMotions:
         if i % 2:
             best = np.argmin(np.abs(degrees - BEST_ROTATION_DEG))
         second = first + 1 + int(best)
-        motion = None
         if degrees[best] > MIN_ROTATION_DEG:
             motion = measured_motion(frames[first], frames[second])
-        if motion:
-            ends.append((first, second))
-            motions.append(motion)
-    between = SE3.stack(motions)[1:]
+            motions[first, second] = motion
+    return motions_of_pairs(motions)
+
+
+def motions_of_pairs(motions: Mapping[tuple[int, int], SE3 | None]) -> PairMotions:
+    """Those of first_from_second by the numbers of the images, where they are known."""
+    known = {pair: motion for pair, motion in motions.items() if motion}
+    between = SE3.stack([SE3.identity(), *known.values()])[1:]
     turns = between.rotation.as_rotvec()
-    pairs = np.array(ends, np.int64).reshape(-1, 2)
-    return PairMotions(pairs, turns, between.translation_m)
+    ends = np.array([*known], np.int64).reshape(-1, 2)
+    return PairMotions(ends, turns, between.translation_m)
 
 
 def measured_motion(first: Frame, second: Frame) -> SE3 | None:
@@ -219,11 +221,17 @@ def measured_motion(first: Frame, second: Frame) -> SE3 | None:
     b = second_rays[second_rows]
     scale = min(1.0, LONG_SIDE / max(first.camera.size))
     threshold = EPIPOLAR_PX / (first.camera.fx * scale)
+    return motion_of_rays(a, b, threshold, MIN_MATCHES)
+
+
+def motion_of_rays(a: Array, b: Array, epipolar: float, least: int = 0) -> SE3 | None:
+    """first_from_second of rays (n, 2) at depth 1, with a translation of length 1.
+
+    None if fewer than `least` are inliers, within `epipolar` of their epipolar lines.
+    """
     cv2.setRNGSeed(0)
-    matrix, inliers = cv2.findEssentialMat(
-        a, b, np.eye(3), cv2.RANSAC, 0.999, threshold
-    )
-    if np.shape(matrix) != (3, 3) or int(inliers.sum()) < MIN_MATCHES:
+    matrix, inliers = cv2.findEssentialMat(a, b, np.eye(3), cv2.RANSAC, 0.999, epipolar)
+    if np.shape(matrix) != (3, 3) or int(inliers.sum()) < least:
         return None
     _, matrix, shift, _ = cv2.recoverPose(matrix, a, b, np.eye(3), mask=inliers)
     second_from_first = SE3.of(Rotation.from_matrix(matrix), shift[:, 0])
