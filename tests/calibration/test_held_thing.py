@@ -172,6 +172,14 @@ def test_the_background_says_whether_the_camera_moved() -> None:
     assert motion_warnings(frames, built, still) == ()
     [words] = motion_warnings(frames, built, bumped)
     assert words.startswith("the background moves by 0.57 deg")
+    uneven = {name: value.copy() for name, value in residuals.items()}
+    for i, away in enumerate(rng.normal(0, 1e-3, (12, 3))):
+        uneven[str(i)][:3] += away + np.array([4.5e-3 * (i >= 6), 0, 0])
+    step = largest_step(np.stack([*uneven.values()]))
+    assert step
+    assert 0.5 < step.share < 0.75
+    arm = MagicMock(hand_eye=MagicMock(residuals=residuals, moved=uneven))
+    assert motion_warnings(frames, arm, still) == ()
     for i in range(6, 12):
         steps[str(i)] += [0.005, 0, 0, 0, 0, 0]
     [words] = motion_warnings(frames, built, still)

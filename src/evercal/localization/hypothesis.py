@@ -1,5 +1,6 @@
 """Hypotheses of a pose in one scene: by PnP, and by alignment of landmarks."""
 
+import math
 from functools import cached_property
 from typing import NamedTuple, Self
 
@@ -107,4 +108,4 @@ def accepted(hypothesis: Hypothesis | None, times: float = 1.0) -> bool:
     """Whether there is a pose with `times` the support that is required."""
     if not hypothesis:
         return False
-    return hypothesis.support >= times * acceptance.required_support()
+    return hypothesis.support >= -times * math.log10(acceptance.FALSE_ACCEPTS)

@@ -28,9 +28,15 @@ from .layouts import (
     marker_map,
     quaternion_table,
 )
-from .tagged import BOX, CAMERA, PLATE, Places, around, photographed
+from .tagged import BOX, CAMERA, PLATE, Places, around, photographed, placed
 
 EQUAL: Places = {number: (pose, 0.04) for number, (pose, _) in PLATE.items()}
+CORNER: Places = {
+    1: (placed(0, 0), 0.05),
+    2: (placed(0.07, 0), 0.05),
+    3: (placed(0, 0.06, 0, (90, 0, 0)), 0.05),
+}
+"""Two tags in one plane, one across."""
 THINGS = {"plate": PLATE, "box": BOX, "equal": EQUAL}
 
 
@@ -107,6 +113,26 @@ def test_images_alone_show_a_layout(thing: str, most_mm: float, stated: bool) ->
     first = next(iter(THINGS[thing]))
     assert own[first] == pytest.approx(square(THINGS[thing][first][1]))
     assert "sides by the images" in notes[0]
+
+
+def test_a_tag_in_one_image(tmp_path: Path) -> None:
+    """It decides the axes of a file where the others lie in one plane; alone it has no place."""
+    file = tmp_path / "layout.csv"
+    file.write_text(quaternion_table(CORNER)[0])
+    found = {}
+    middle = np.mean([pose.translation_m for pose, _ in CORNER.values()], 0)
+    for i, view in enumerate(around(4, middle, 4, 35)):
+        grey = photographed(CORNER, view, seed=i)[..., 0]
+        found[str(i)] = find_markers(grey, board(-1, 0.04))
+    assert sum(3 in markers.ids for markers in found.values()) == 1
+    own, notes = Arrangement(board(1, 0.05), CAMERA.size, CAMERA, file)(found)
+    right = corners(CORNER)
+    for number, points in corners_of(own).items():
+        assert points == pytest.approx(right[number] - right[1].mean(0), abs=1e-6)
+    assert not notes
+    own, notes = Arrangement(board(1, 0.05), CAMERA.size, CAMERA)(found)
+    assert corners_of(own).keys() == {1, 2}
+    assert "fewer than two images, not used: 3" in notes[1]
 
 
 def test_tags_of_as_many_images_are_placed_together(
@@ -192,5 +218,5 @@ def test_tags_that_are_never_together_are_no_layout() -> None:
         name: markers.without([7, 12, 20] if int(name) % 2 else [3])
         for name, markers in images("plate", 6, 40).items()
     }
-    with pytest.raises(InputError, match="no image shows tag 3 beside another one"):
+    with pytest.raises(InputError, match="no two images show tag 3 beside the same"):
         Arrangement(board(3, 0.04), CAMERA.size, CAMERA)(found)

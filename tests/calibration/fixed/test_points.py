@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -249,3 +250,35 @@ def test_points_are_paired_by_name_else_in_order(tmp_path: Path) -> None:
     second.write_text("name,x,y,z\nq,0,3,0\n")
     with pytest.raises(InputError, match="names no point of"):
         paired_positions(first, second)
+
+
+@pytest.mark.parametrize("change", [{"fx": 500.0, "fy": 501.0}, {"cx": 372.0}])
+def test_picks_in_a_volume_contradict_another_camera(change: dict[str, float]) -> None:
+    rng = np.random.default_rng(3)
+    seen, base = points(20, 3)
+    pixels = CAMERA.project(seen) + rng.normal(0, 0.7, (20, 2))
+    known = {f"p{i}": point for i, point in enumerate(base)}
+    picks = [PickedPoint("a.png", f"p{i}", pixel) for i, pixel in enumerate(pixels)]
+    with pytest.raises(InputError, match=r"the picks fit a focal length of 6[0-4]"):
+        solve_picks(known, picks, replace(CAMERA, **change), 5e-4, 1.0)
+    checks = solve_picks(known, picks, CAMERA, 5e-4, 1.0).checks
+    some = solve_picks(known, picks[:6], CAMERA, 5e-4, 1.0).checks
+    assert not any("would not show" in text for text in checks.left_open or ())
+    assert any("would not show" in text for text in some.left_open or ())
+
+
+@pytest.mark.parametrize("depth_m", [0.001, 0.003, 0.006])
+@pytest.mark.parametrize("count", [6, 12])
+def test_right_points_of_a_depth_camera_are_used(count: int, depth_m: float) -> None:
+    for seed in range(10):
+        rng = np.random.default_rng([seed, count])
+        seen, base = points(count, seed)
+        noisy = seen + rng.normal(0, depth_m, seen.shape) * [0.4, 0.4, 1]
+        found = solve_points(tuple(map(str, range(count))), base, noisy)
+        assert all(image.used for image in found.images)
+
+
+def test_points_behind_a_camera_are_named() -> None:
+    seen, base = points(12, 0)
+    found = solve_points(tuple(map(str, range(12))), base, seen * [1, -1, -1])
+    assert "have negative z, behind it" in " ".join(found.checks.warnings or ())

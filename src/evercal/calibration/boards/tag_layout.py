@@ -44,6 +44,8 @@ _SCALES = np.geomspace(0.2, 5, 41)
 """Sides of a tag that are tried first, sides of the kept one."""
 _MOST_IMAGES = 60
 """Number of images that place a tag."""
+_LEAST_IMAGES = 2
+"""Least number of images that place a tag: in one, a large tag far away looks like a small one."""
 _AT_ONCE = 0.7
 """Tags are placed together with the one of most images if they have this share of them."""
 
@@ -96,7 +98,8 @@ class Arrangement:
         corners: Corners = {}
         with named_errors(path, "layout of tags"):
             for reading in layout_readings(tags, self.board.size_m):
-                own = np.median([_misfit(image, reading, camera) for image in images])
+                # Images of tags in one plane fit several readings.
+                own = np.mean([_misfit(image, reading, camera) for image in images])
                 if own < misfit - 1e-6:
                     misfit = float(own)
                     corners = reading
@@ -138,8 +141,8 @@ class Arrangement:
         corners = _placed(found, kept, self.board.size_m, camera)
         if len(corners) < 2:
             raise InputError(
-                f"no image shows tag {kept} beside another one; `layout` estimate takes images"
-                " that show two tags or more"
+                f"no two images show tag {kept} beside the same other one; `layout` estimate takes"
+                " images that show two tags or more"
             )
         alone = sorted({*counts} - {*corners})
         start = Bundle(corners, camera)
@@ -148,7 +151,10 @@ class Arrangement:
         notes = [f"sides by the images, mm: {', '.join(sides)}"]
         if alone:
             names = ", ".join(map(str, alone))
-            notes.append(f"tags never visible beside the others, not used: {names}")
+            notes.append(
+                "tags visible beside the others in fewer than two images, not used:"
+                f" {names}"
+            )
         return corners, tuple(notes)
 
 
@@ -192,11 +198,11 @@ def _placed(
                 if poses:
                     corners = (base @ SE3.stack(poses))[:, None].apply(points)
                     beside.setdefault(number, []).append((eye, corners - eye))
-        if not beside:
+        most = max(map(len, beside.values()), default=0)
+        if most < _LEAST_IMAGES:
             return placed
-        most = max(map(len, beside.values()))
         for number, images in beside.items():
-            if len(images) >= _AT_ONCE * most:
+            if len(images) >= max(_LEAST_IMAGES, _AT_ONCE * most):
                 few = images[:_MOST_IMAGES]
                 sizes = [_recurring(few, scale) for scale in _SCALES]
                 placed[number] = min(sizes, key=lambda pair: pair[0])[1]

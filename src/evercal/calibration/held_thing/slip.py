@@ -15,6 +15,8 @@ SLIP_CHANCE = 1e-4
 """Largest probability of a step by chance."""
 SLIP_SHARE = 0.5
 """Least share of the sum of squared residuals that a step explains."""
+CLEAR_SHARE = 0.75
+"""The same of a camera whose background stands still: neighbouring poses of an arm err alike."""
 
 MOVED_DEG = 0.1
 """Motion of the background above which the camera moved; tracking errs by a tenth of it."""
@@ -67,6 +69,8 @@ def motion_warnings(
     if largest:
         first = names[largest.before]
         if what == "the camera" and drift_deg < MOVED_DEG:
+            if largest.share < CLEAR_SHARE:
+                return ()
             return (
                 f"the gripper's poses and the images part before image {first}, while the"
                 f" background stands still to {drift_deg:.2f} deg: the camera did not move; check"
