@@ -44,3 +44,10 @@ def test_a_small_change_and_few_frames_are_none() -> None:
     assert LensChange.of(measured(step[:6], 0)) == LensChange()
     unknown = np.full((FRAMES, 2), np.nan)
     assert LensChange.of(unknown) == LensChange()
+
+
+def test_two_frames_with_wrong_poses_are_no_autofocus() -> None:
+    focal = measured(np.zeros(FRAMES), 1)
+    focal[3] = 0.15, 0.026
+    focal[0] = 0.29, 0.055
+    assert LensChange.of(focal) == LensChange()

@@ -184,13 +184,13 @@ def calibration_lines(
     yield f"  quaternion   {numbers(pose.rotation_wxyz, '+.6f')} wxyz"
     spread = motion(calibration.sigma_mm, calibration.sigma_deg)
     yield f"  uncertainty  {spread} (standard deviation per axis)"
-    yield from lens_lines(calibration)
     terms = calibration.error_terms
     for term, share in zip(terms, position_shares(terms), strict=True):
         if term.translation_mm >= 0.005 or term.rotation_deg >= 0.0005:
             size = motion(term.translation_mm, term.rotation_deg)
             part = f"{100 * share:.0f} % of the position's variance"
             yield f"    of it      {size}: {term.name} ({part})"
+    yield from lens_lines(calibration)
     if point:
         yield f"  point        {point.text(calibration.uncertain_pose)}"
     yield from held_out_lines(calibration)

@@ -61,9 +61,9 @@ class Inspect(args.Verb):
         if self.coverage or self.next:
             self._advise(recording, record, lines)
         verb = ["learn", "MAP"]
-        still = bool(recording.arm) and STILL in str(inspection.warnings)
+        still = STILL in str(inspection.warnings)
         if still:
-            verb = ["arm-in-view"]
+            verb = ["arm-in-view"] if recording.arm else ["eye-to-hand"]
         reading = self._joints(recording, still, record, lines)
         then = [*verb, self.scene, *reading.words()]
         self.answer(record, *lines, then=then)
