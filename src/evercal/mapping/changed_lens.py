@@ -25,8 +25,9 @@ CHANCE = 1e-4
 """Probability that the best step among random deviations counts."""
 FEWEST = 4
 """Least number of frames before and after a step."""
-MEDIAN = 0.6745
-"""Median of normal deviations without their sign, standard deviations."""
+TYPICAL = 1.8
+"""Least median of deviations from frame to frame, standard deviations; 0.67 by noise, and up to 1.3
+in real images."""
 LEAST_VARIANCE = 1e-7
 """Variance of the focal length of a frame by other errors, as a share: 0.03 % squared."""
 
@@ -60,10 +61,12 @@ class LensChange(NamedTuple):
             if rest < left:
                 left = float(rest)
                 best = cls(float(after - before), int(known[split]))
+        scatter = max(0.0, squares / len(known) - 1) / weight.mean()
+        scatter = math.sqrt(scatter)
         # A few frames whose poses are wrong are no autofocus.
-        typical = np.median(np.abs(change - mean) * np.sqrt(weight)) / MEDIAN
-        excess = max(0.0, min(squares / len(known), typical**2) - 1)
-        scatter = math.sqrt(excess / weight.mean())
+        typical = np.median(np.abs(change - mean) * np.sqrt(weight))
+        if typical < TYPICAL:
+            scatter = 0.0
         explained = squares - left
         freedom = len(known) - 2
         by_chance = f.isf(CHANCE / len(known), 1, freedom) * left / freedom
@@ -71,7 +74,7 @@ class LensChange(NamedTuple):
             size, first = best
         else:
             size, first = scatter, -1
-            explained = excess * len(known)
+            explained = squares - len(known)
         if abs(size) < LEAST or explained < SIGNIFICANT**2:
             return cls()
         return cls(size, first)
