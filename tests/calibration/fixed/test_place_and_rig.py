@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -243,17 +244,24 @@ def reversed_rows(lines: list[list[str]]) -> None:
         row[1:] = pose
 
 
-def larger(lines: list[list[str]]) -> None:
+def larger(lines: list[list[str]], times: float = 1.5) -> None:
     for row in lines:
-        row[1:4] = [str(1.5 * float(value)) for value in row[1:4]]
+        row[1:4] = [str(times * float(value)) for value in row[1:4]]
+
+
+def pushed(lines: list[list[str]]) -> None:
+    for row in lines[5:]:
+        row[1] = str(float(row[1]) + 0.02)
 
 
 @pytest.mark.parametrize(
     ("wreck", "message"),
     [
+        (pushed, r"right, or a camera beside it, moved by 2[0-3] mm .* before .*5"),
         (inverse, "`invert` camera"),
         (reversed_rows, "one name"),
         (larger, "1.5 times as far"),
+        (partial(larger, times=1.03), r"1\.0[34] times as far"),
     ],
 )
 def test_cameras_that_contradict_each_other_are_refused(

@@ -16,6 +16,7 @@ from evercal.calibration.calibration import Calibration, Rig, RigPair
 from evercal.calibration.checks import Checks
 from evercal.calibration.fixed.corner_fit import widening
 from evercal.calibration.fixed.sightings import Sightings, judged
+from evercal.calibration.held_thing.slip import CLEAR_SHARE, largest_step
 from evercal.calibration.pose_pairs.checks import SIZE_SIGMA
 from evercal.errors import InputError
 from evercal.geometry import (
@@ -23,6 +24,7 @@ from evercal.geometry import (
     UncertainPose,
     average_poses,
     deviations,
+    length_mm_deg,
     norms,
     spread,
 )
@@ -43,7 +45,7 @@ _LEAST_FOR_SIZE = 5
 """Least number of moments that tell the size of the board."""
 _MOST_FOR_SIZE = 100
 """Number of moments whose distances are compared."""
-_OTHER_SIZE = 0.04
+_OTHER_SIZE = 0.015
 """Logarithm of a ratio of lengths above which two boards differ in size."""
 _MOST_APART = 0.03
 """Largest usual residual of a position, share of the distance to the board."""
@@ -156,7 +158,16 @@ def _placed(
         theirs = camera.poses[rows]
         ours = SE3.stack([boards[camera.moments[row]] for row in rows])
         _require_one_size(camera.name, theirs.translation_m, ours.translation_m)
-        pose = average_poses(ours @ theirs.inverse())
+        each = ours @ theirs.inverse()
+        pose = average_poses(each)
+        step = largest_step(deviations(each, pose))
+        if step and step.share > CLEAR_SHARE:
+            millimetres, degrees = length_mm_deg(step.size)
+            raise InputError(
+                f"{camera.name}, or a camera beside it, moved by {millimetres:.0f} mm and"
+                f" {degrees:.1f} deg before {camera.images[rows[step.before]]}: fasten the cameras"
+                " and record again, or use the images before or after"
+            )
         placed[camera.name] = pose
         for moment, shown in zip(camera.moments, camera.poses, strict=True):
             boards.setdefault(moment, pose @ shown)

@@ -16,7 +16,7 @@ SLIP_CHANCE = 1e-4
 SLIP_SHARE = 0.5
 """Least share of the sum of squared residuals that a step explains."""
 CLEAR_SHARE = 0.75
-"""The same of a camera whose background stands still: neighbouring poses of an arm err alike."""
+"""The same where other errors are likelier: neighbouring poses of an arm err alike."""
 
 MOVED_DEG = 0.1
 """Motion of the background above which the camera moved; tracking errs by a tenth of it."""
