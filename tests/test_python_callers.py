@@ -109,7 +109,7 @@ WRONG: dict[str, tuple[Callable[[Map], object], str]] = {
     ),
     "neither images nor points": (
         lambda cell: cell.align("hall", [IMAGE]),
-        "give images with robot_poses, or points with picks",
+        "give images with robot_poses, points with picks, or board_poses",
     ),
     "a camera on the gripper to check": (
         lambda cell: cell.check(

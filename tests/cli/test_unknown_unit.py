@@ -158,7 +158,8 @@ def test_alignment_gives_metres(run, phone_store, four_images, hall, tmp_path):
     assert ran.code == 0, ran.err
     assert ran.json["scale"] == pytest.approx(1 / UNITS, rel=0.01)
     out = tmp_path / "c.json"
-    assert run("calibrate", store, four_images, "--out", out).code == 0
+    ran = run("calibrate", store, four_images, "--out", out)
+    assert ran.code == 0, ran.out
     calibration = read_calibration(out)
     assert calibration.parent_frame == "base_link"
     pose = calibration.parent_from_child

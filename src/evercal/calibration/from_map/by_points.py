@@ -146,8 +146,14 @@ def fit_picks(
         translation = rotation.apply(shift) * growth + centre + small[:3]
         return Similarity(SE3.of(rotation * before, translation), start.scale * growth)
 
+    weights = [1 / np.hypot(1, _pose_px(image, start)) for image in images]
+
     def residuals(small: Array) -> Array:
-        return np.concatenate([_distances(image, moved(small)) for image in images])
+        similarity = moved(small)
+        rows = []
+        for image, weight in zip(images, weights, strict=True):
+            rows.append(weight * _distances(image, similarity))
+        return np.concatenate(rows)
 
     fit = least_squares(
         residuals, np.zeros(6 if scale_known else 7), loss="cauchy", f_scale=2.0
@@ -160,32 +166,64 @@ def fit_picks(
     information = fit.jac.T @ fit.jac
     inverse = np.linalg.inv(information)
     covariance[:count, :count] = sigma2 * inverse
-    covariance[:count, :count] += _by_poses(images, moved(fit.x), -inverse @ fit.jac.T)
+    gains = -inverse @ fit.jac.T
+    covariance[:count, :count] += _by_poses(images, weights, moved(fit.x), gains)
     # From a motion about the points' centre to one about the base's origin.
     slope = np.eye(7)
     slope[:3, 3:6] = cross_matrix(centre)
-    rms = float(np.sqrt((rest.reshape(-1, 2) ** 2).sum(1).mean()))
-    return moved(fit.x), slope @ covariance @ slope.T, rms
+    similarity = moved(fit.x)
+    pixels = np.concatenate([_distances(image, similarity) for image in images])
+    rms = float(np.sqrt(2 * (pixels**2).mean()))
+    return similarity, slope @ covariance @ slope.T, rms
 
 
-def _by_poses(images: Sequence[Picks], similarity: Similarity, gains: Array) -> Array:
+def _by_poses(
+    images: Sequence[Picks],
+    weights: Sequence[float],
+    similarity: Similarity,
+    gains: Array,
+) -> Array:
     """(k, k) covariance of a fit by errors of the poses, with gains (k, m) of its residuals.
 
-    Images of one map err alike by an unknown share: this is the most that any share gives.
+    Images err apart, and alike: in the axes of the map, and by their intrinsics in those of the
+    camera. How large each part is, is unknown; all three are taken for the whole.
     """
-    covariance = np.zeros((len(gains), len(gains)))
     ends = np.cumsum([2 * len(image.names) for image in images])
-    for image, columns in zip(images, np.split(gains, ends[:-1], 1), strict=True):
-        slopes = []
-        for step in _POSE_STEP * np.eye(6):
-            rotation = image.map_from_camera.rotation * Rotation.from_rotvec(step[3:])
-            position = image.map_from_camera.translation_m + step[:3]
-            other = image._replace(map_from_camera=SE3.of(rotation, position))
-            change = _distances(other, similarity) - _distances(image, similarity)
-            slopes.append(columns @ change / _POSE_STEP)
-        slope = np.transpose(slopes)
-        covariance += slope @ image.covariance @ slope.T
-    return len(images) * covariance
+    apart = np.zeros((len(gains), len(gains)))
+    alike = np.zeros((2, len(gains), 6))
+    usual = np.zeros((2, 6, 6))
+    for image, weight, columns in zip(
+        images, weights, np.split(gains, ends[:-1], 1), strict=True
+    ):
+        slope = weight * columns @ _pose_slopes(image, similarity)
+        apart += slope @ image.covariance @ slope.T
+        own = np.eye(6)
+        own[:3, :3] = image.map_from_camera.rotation_matrix()
+        common = np.eye(6)
+        common[3:, 3:] = own[:3, :3].T
+        for kind, axes in enumerate((own, common)):
+            alike[kind] += slope @ axes
+            usual[kind] += weight**2 * axes.T @ image.covariance @ axes
+    usual /= np.sum(np.square(weights))
+    return apart + (alike @ usual @ alike.swapaxes(1, 2)).sum(0)
+
+
+def _pose_px(image: Picks, similarity: Similarity) -> float:
+    """Root mean square error of a pixel by the error of the pose."""
+    slopes = _pose_slopes(image, similarity)
+    return float(np.sqrt(np.mean((slopes @ image.covariance) * slopes) * 6))
+
+
+def _pose_slopes(image: Picks, similarity: Similarity) -> Array:
+    """(2k, 6) change of the pixels of the points by that of the pose, see `UncertainPose`."""
+    at = _distances(image, similarity)
+    slopes = []
+    for step in _POSE_STEP * np.eye(6):
+        rotation = image.map_from_camera.rotation * Rotation.from_rotvec(step[3:])
+        position = image.map_from_camera.translation_m + step[:3]
+        other = image._replace(map_from_camera=SE3.of(rotation, position))
+        slopes.append((_distances(other, similarity) - at) / _POSE_STEP)
+    return np.transpose(slopes)
 
 
 def _distances(image: Picks, similarity: Similarity) -> Array:
