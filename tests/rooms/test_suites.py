@@ -77,7 +77,7 @@ def test_interrupted_runs_continue_with_the_same_result(
     for _ in range(3):
         next(run)
     run.close()
-    with pytest.raises(InputError, match="no known scene format"):
+    with pytest.raises(InputError, match=r"3 images in .* without poses"):
         load_recording(cut / "kitchen")
     # An image without its depth is rendered again.
     (cut / "kitchen/depth/000001.png").unlink()
