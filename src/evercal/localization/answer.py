@@ -19,11 +19,11 @@ def rejection(
     hypothesis: Hypothesis | None, scene: SceneMap, mirrored: float = 0.0
 ) -> str:
     """Why a pose is not accepted; `mirrored` is the support of the mirror image."""
-    if mirrored > acceptance.required_support():
+    required = acceptance.required_support()
+    if mirrored > required:
         return _mirrored_reason(hypothesis.support if hypothesis else 0.0, mirrored)
     if not hypothesis:
         return "fewer than 6 inliers"
-    required = acceptance.required_support()
     share = f"{100 * hypothesis.inlier_ratio:.0f} %"
     return (
         f"{hypothesis.inliers} inliers, {share} of the landmarks of {scene.name} that should be"

@@ -3,7 +3,7 @@
 A phone video gives a map with an arbitrary frame, and perhaps scale. A few images from a camera on
 the gripper determine the base: with gripper poses A, map poses B of the camera and
 X = gripper_from_camera, A X = Z B holds for Z = base_from_map, and both are estimated together.
-Alternatively, points that the tool has touched are picked in images.
+`by_points` and `by_board` do without a robot that moves the camera.
 """
 
 from collections.abc import Mapping

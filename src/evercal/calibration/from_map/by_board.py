@@ -31,7 +31,7 @@ def align_by_board(
         localizer: Localizer of the store.
         scene: Name of the scene.
         board_poses: File of `evercal detect`: two images or more, from different places.
-        base_from_board: Place of the board; None for a base that is the board.
+        base_from_board: Place of the board. By default the board frame is the base frame.
         scale_known: Whether the scene was learned in metres.
     """
     place = base_from_board or UncertainPose.exact(SE3.identity())

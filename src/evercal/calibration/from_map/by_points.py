@@ -185,8 +185,8 @@ def _by_poses(
 ) -> Array:
     """(k, k) covariance of a fit by errors of the poses, with gains (k, m) of its residuals.
 
-    Images err apart, and alike: in the axes of the map, and by their intrinsics in those of the
-    camera. How large each part is, is unknown; all three are taken for the whole.
+    Errors of the poses may be independent, common in the axes of the map, or common in the axes of
+    the camera, as by wrong intrinsics. Their shares are unknown, so each counts as the whole.
     """
     ends = np.cumsum([2 * len(image.names) for image in images])
     apart = np.zeros((len(gains), len(gains)))

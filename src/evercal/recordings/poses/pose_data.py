@@ -266,7 +266,7 @@ def _of_role(columns: Columns, given: Given, robot: bool) -> Columns:
 
 
 def _is_inverse(key: str, robot: bool) -> bool:
-    """Whether a key says that its poses are those of the base in what moves."""
+    """Whether a key names the inverse: poses of the base in the frame that moves."""
     for moved, fixed in _INVERSES[robot]:
         forms = [
             rf"(?<![a-z])({moved})_from_({fixed})",

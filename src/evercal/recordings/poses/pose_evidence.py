@@ -193,7 +193,7 @@ def measured_motions(frames: Sequence[Frame], poses: SE3) -> PairMotions:
 
 
 def motions_of_pairs(motions: Mapping[tuple[int, int], SE3 | None]) -> PairMotions:
-    """Those of first_from_second by the numbers of the images, where they are known."""
+    """Motions first_from_second by pairs of image numbers; pairs without one are left out."""
     known = {pair: motion for pair, motion in motions.items() if motion}
     between = SE3.stack([SE3.identity(), *known.values()])[1:]
     turns = between.rotation.as_rotvec()
