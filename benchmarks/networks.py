@@ -116,7 +116,7 @@ def experiments(
         "memory": memory,
         "b": [head, replace(head, compared=tuned_head)],
         "c": [unseen, replace(unseen, compared=chosen(["evercal"]), seeds="0")],
-        "d": at_480(unseen, data / "sim-unseen-480", out / "networks-d"),
+        **at_480(unseen, data / "sim-unseen-480", out),
         "share": shares(gate, out),
         "real": [replace(real, steps=2 * STEPS)],
         "paper": [
@@ -130,12 +130,16 @@ def experiments(
     }
 
 
-def at_480(unseen: Experiment, data: Path, out: Path) -> Sequence[Experiment]:
-    """Return experiment C on rooms of 640x480 pixels: joint training first, its gate."""
-    gate = replace(
-        unseen, data=data, out=out, short_side=480, compared=chosen(["joint"])
-    )
-    return [gate, replace(gate, compared=chosen(AT_480))]
+def at_480(
+    unseen: Experiment, data: Path, out: Path
+) -> Mapping[str, Sequence[Experiment]]:
+    """Return experiment C on rooms of 640x480 pixels, and its gate: joint training."""
+    rows = replace(unseen, data=data, out=out / "networks-d", short_side=480)
+    rows = replace(rows, compared=chosen(["joint", *AT_480]))
+    gate = replace(rows, seeds="0", compared=chosen(["joint"]))
+    half = replace(gate, short_side=240, out=out / "networks-d-240")
+    doubled = replace(gate, steps=4 * STEPS, out=out / "networks-d-4800")
+    return {"d-gate": [half, gate, doubled], "d": [rows]}
 
 
 def shares(gate: Experiment, out: Path) -> Sequence[Experiment]:
@@ -163,8 +167,8 @@ def run(
 
     Args:
         names: gate (joint training of `a`, whose accuracy decides whether the others are run), a,
-            memory, b, c, d (rooms of 640x480), share (replayed rows of SPDD), real (needs the
-            recordings) and paper (needs a GPU).
+            memory, b, c, d-gate and d (rooms of 640x480), share (replayed rows of SPDD), real
+            (needs the recordings) and paper (needs a GPU).
         data: Folder of the rooms, rendered with `python -m rooms SUITE --out DATA/SUITE`.
         out: Folder of results.
         device: Device of the networks: auto, cpu or cuda.

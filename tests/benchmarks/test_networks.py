@@ -13,7 +13,7 @@ from evercal.errors import InputError
 def test_experiments_have_valid_options_and_folders_of_their_own() -> None:
     known = networks.experiments(Path("rooms"), Path("runs"), "cpu")
     folders = {experiment.out for of in known.values() for experiment in of}
-    assert len(folders) == 13, "the gate is a part of experiment A"
+    assert len(folders) == 15, "the gate is a part of experiment A"
     for experiment in (experiment for of in known.values() for experiment in of):
         assert experiment.data is not None
         assert experiment.data.parent == Path("rooms")
@@ -33,7 +33,7 @@ def test_filled_sars_has_the_setting_of_sars_spdd() -> None:
 
 
 def test_an_unknown_experiment_is_refused() -> None:
-    listed = "choose of gate, a, memory, b, c, d, share, real, paper"
+    listed = "choose of gate, a, memory, b, c, d-gate, d, share, real, paper"
     for names in ((), ("e",)):
         with pytest.raises(InputError, match=listed):
             networks.run(names)
