@@ -144,16 +144,16 @@ def at_480(
 
 def shares(gate: Experiment, out: Path) -> Sequence[Experiment]:
     """Return runs of SPDD with other shares of replayed rows and weights, on held-out frames."""
+    filled = strategy_named("sars_spdd_filled")
+    trials = []
+    for weight in (3.0, 10.0):
+        named = f"{filled.name}@{weight:g}"
+        trials.append(replace(filled.weighted(weight), name=named))
+    sweep = replace(gate, compared=tuple(trials), seeds="0", held_out=True)
     experiments = []
-    for share in (0.25, 0.5, 1.0, 2.0):
-        trials = []
-        for name in ("sars_spdd", "sars_spdd_filled"):
-            for weight in (3.0, 10.0, 30.0):
-                trial = strategy_named(name).weighted(weight)
-                trials.append(replace(trial, name=f"{name}@{weight:g}"))
-        sweep = replace(gate, compared=tuple(trials), replay=share, held_out=True)
-        named = out / f"networks-share-{share:g}"
-        experiments.append(replace(sweep, seeds="0", out=named))
+    for share in (0.5, 1.0, 2.0):
+        folder = out / f"networks-share-{share:g}"
+        experiments.append(replace(sweep, replay=share, out=folder))
     return experiments
 
 
