@@ -12,6 +12,7 @@ import pandas as pd
 from benchmarks import network_tables
 from benchmarks.network_tables import FOLDER
 from evercal.continual.benchmark.results import Table
+from evercal.continual.strategies import strategy_named
 from evercal.evaluation.metrics import CHI2_6
 
 FIGURE = FOLDER.parent / "docs" / "networks.svg"
@@ -199,6 +200,8 @@ def _tuning(name: str, suite: str) -> Callable[[], Table]:
     def table() -> Table:
         lines = []
         for method, trials in rows_of(name).groupby("method", sort=False):
+            tuned = strategy_named(str(method)).method
+            assert tuned, "only a method has a weight"
             columns = [trials[key] for key in ("auc_earlier", "auc_newest")]
             cells = [f"{old:.0f}+{new:.0f}" for old, new in zip(*columns, strict=True)]
             best = int(trials["auc_20cm"].to_numpy().argmax())
@@ -206,7 +209,7 @@ def _tuning(name: str, suite: str) -> Callable[[], Table]:
             values = ", ".join(f"{value:g}" for value in trials["value"])
             line = {
                 "method": method,
-                "setting": trials["setting"].iloc[0],
+                "setting": tuned.weight_field,
                 "trials": values,
             }
             lines.append(line | {suite: ", ".join(cells)})

@@ -7,7 +7,6 @@ replay loss is reprojection to the known poses plus the distance to the old netw
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -20,9 +19,7 @@ from evercal.mapping.selection import select_farthest
 
 @dataclass(frozen=True)
 class Spread(Replay):
-    """Farthest-point sampling with reprojection and distillation."""
-
-    citation: ClassVar[str] = "farthest-point sampling (Gonzalez, 1985)"
+    """Farthest-point sampling (Gonzalez, 1985) with reprojection and distillation."""
 
     def select(self, frames: FrameStatistics, capacity: int) -> np.ndarray:
         """Select at most `capacity` frames; return sorted indices."""

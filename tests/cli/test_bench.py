@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import pandas as pd
 import pytest
+from filelock import FileLock
 
 from evercal.cli import bench as verb
 from evercal.continual.benchmark.results import FRAMES, STRATEGIES, read
@@ -33,6 +34,14 @@ def test_bench_and_its_tables(run, small, arcs, tmp_path):
             folders[-1], replace(scene, train=scene.train[:18], test=scene.test[:4])
         )
     words = ["custom", *folders, "--strategies evercal,finetune --seeds 0"]
+    (tmp_path / "out" / "runs").mkdir(parents=True)
+    claims = [
+        tmp_path / "out/runs" / f"{name}-0.claim" for name in ("evercal", "finetune")
+    ]
+    with FileLock(claims[0]), FileLock(claims[1]):
+        shared = run("bench", *words, "--out", tmp_path / "out")
+        assert shared.code == 0
+        assert "other processes have all runs" in shared.out
     first = run("bench", *words, "--out", tmp_path / "out")
     assert first.code == 0, first.err
     assert "[4/4] finetune seed 0: one " in first.out
@@ -120,6 +129,9 @@ def test_options_of_the_backbone_of_the_paper():
         verb.Bench("sim", preset="paper", batch=n)._stage(0) for n in (None, 2048)
     )
     assert (whole.fit.batch, whole.fit.replay_batch) == (40_960, 40_960)
+    assert (whole.fit.peak_rate, whole.fit.matrix_rate) == (0.005, 0)
+    assert whole.fit.iterations == 5_000
+    assert verb.Bench("i7s", preset="paper")._stage(0).fit.iterations == 15_000
     changed = replace(whole.fit, batch=2048, replay_batch=2048)
     assert part == replace(whole, fit=changed)
     assert verb.Bench("sim-mini", batch=512)._stage(0).fit.replay_batch == 256
@@ -146,3 +158,25 @@ def test_the_papers_working_images_are_not_larger_than_the_recorded(hall):
     assert [sides(factor) for factor in (0.5, 1, 1.5, 3)] == [
         (s, 240) for s in (240, 240, 360, 480)
     ]
+
+
+def test_a_folder_may_have_the_name_of_its_suite(run, monkeypatch, tmp_path):
+    (tmp_path / "sim-mini").mkdir()
+    monkeypatch.chdir(tmp_path)
+    refused = run("bench sim-mini --strategies er --seeds x --out sim-mini")
+    assert "--seeds x" in " ".join(refused.err), "the suite is run"
+    refused = run("bench ./sim-mini")
+    assert "no complete run" in " ".join(refused.err), "the folder is shown"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--memory auto", "only a map selects"),
+        ("--preset paper --backbone paper_head", "omit the option"),
+    ],
+)
+def test_options_that_contradict_are_refused(run, words, message):
+    refused = run("bench sim-mini --strategies er --seeds 0", words)
+    assert refused.code == 2
+    assert message in " ".join(refused.err)

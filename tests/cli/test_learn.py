@@ -125,7 +125,7 @@ def test_interrupt_leaves_no_map(rooms, tmp_path):
                 break
         assert process.returncode == 130
         messages = process.stderr.read()
-    assert "stopped; the same command starts again" in messages
+    assert "stopped; run the same command again" in messages
     assert "Traceback" not in messages
     assert not (store / "manifest.json").exists()
 

@@ -90,7 +90,7 @@ def test_options_of_a_training():
         preset="demo", backbone="paper", offsets="shared", centres=7, steps=9, batch=128
     )
     stage = paper.stage(3, "5MB")
-    assert (stage.seed, stage.encode.seed, stage.memory.bytes) == (3, 3, 5_000_000)
+    assert (stage.seed, stage.memory.bytes) == (3, 5_000_000)
     assert (stage.fit.iterations, stage.fit.batch, stage.fit.replay_batch) == (
         9,
         128,

@@ -66,11 +66,14 @@ class Bench(args.Verb, Training):
     """Folder of results. The same command resumes there; in a second process it shares the runs."""
 
     def run(self) -> int:
-        if Path(self.suite).is_dir():
+        from evercal.continual.benchmark.suites import SUITES, tuning_split
+
+        # A folder may have the name of a suite, whose run it has.
+        if Path(self.suite).is_dir() and self.suite not in {*SUITES, "custom"}:
             return self._show(Path(self.suite))
         seeds = _numbers(self.seeds)
+        from evercal.continual.benchmark import comparison, results
         from evercal.continual.benchmark.bench import BenchOptions, run_bench
-        from evercal.continual.benchmark.suites import tuning_split
         from evercal.continual.benchmark.tuning import run_tuning
         from evercal.continual.learning.presets import short_side
 
@@ -97,6 +100,9 @@ class Bench(args.Verb, Training):
             run = run_tuning if self.tune else run_bench
             for step in run(scenes, options, self.out):
                 bars.write(_progress(step, self.suite))
+        if comparison.complete_runs(results.read(self.out)).empty:
+            self.answer({"runs": []}, "other processes have all runs")
+            return 0
         return self._show(self.out, strategies[0].name)
 
     def _show(self, folder: Path, reference: str = "") -> int:

@@ -53,7 +53,7 @@ class NetworkOptions(Training):
 
 @frozen
 class Learn(args.Verb):
-    """Learn a scene from a recording; scenes learned before do not change.
+    """Learn a scene from a recording; a map's other scenes do not change.
 
     A recording with gripper poses and no camera poses also yields gripper_from_camera. Several
     recordings become one scene each, several at once with --workers. A new map gets a new folder.
@@ -183,7 +183,7 @@ class Learn(args.Verb):
         try:
             report = self._learned(recording, strategy)
         except KeyboardInterrupt:
-            print("stopped; the same command starts again", file=sys.stderr)
+            print("stopped; run the same command again", file=sys.stderr)
             return 130
         lines = list(summary(report, self.calibration or self.store))
         if self.calibration:
@@ -197,6 +197,7 @@ class Learn(args.Verb):
         start = f"{recording.name}: {len(recording.train)} training frames"
         with Bars(self.log, start) as bars:
             if strategy != args.MAP:
+                self._refuse("is for a map; omit the option", "base", "replace")
                 return learn_into_networks(self, strategy, recording, bars)
             from evercal.map import Map
             from evercal.mapping.build import MapOptions
@@ -261,19 +262,26 @@ def learn_into_networks(
         NetworkLearnOptions,
         learn_networks,
     )
+    from evercal.continual.store import NetworkStore
+    from evercal.continual.strategies import strategy_named
+    from evercal.storage.stages import is_store
 
     wanted = given.networks
     if wanted.seed < 0:
         raise InputError(f"--seed {wanted.seed}: give a number >= 0")
     wanted.load_plugin()
     chosen = wanted.strategy(strategy)
+    if is_store(given.store):
+        # The weight is that of the network which the store has.
+        for head in NetworkStore.open(given.store).contents.heads[-1:]:
+            paper_head = head.options.condition == "descriptor"
+            chosen = strategy_named(strategy, paper_head)
     if wanted.weight is not None:
         chosen = chosen.weighted(wanted.weight)
     options = NetworkLearnOptions(
         strategy=chosen,
         preset=wanted.preset,
-        stage=wanted.stage(wanted.seed, given.memory or "10%"),
-        centres=wanted.centres,
+        stage=wanted.stage(wanted.seed, given.memory),
         encoder=given.encoder,
         device=wanted.device,
     )

@@ -60,7 +60,7 @@ class Training:
         return strategy_named(name, paper_head=not ours)
 
     def stage(
-        self, seed: int, memory: str, centres: Literal["grow", "fixed"] = "grow"
+        self, seed: int, memory: str | None, centres: Literal["grow", "fixed"] = "grow"
     ) -> "StageOptions":
         """Options of a scene; `fixed` centres are those of all scenes, for the paper's network."""
         from evercal.continual.learning.presets import BACKBONES, preset
@@ -73,7 +73,13 @@ class Training:
             stage = preset(self.preset, seed).with_memory(memory)
         except InputError as error:
             raise InputError(f"--{error}") from None
-        backbone = "paper" if self.preset == "paper" else self.backbone
+        backbone = self.backbone
+        if self.preset == "paper":
+            if backbone == "paper_head":
+                raise InputError(
+                    "--backbone paper_head: preset paper has the paper's training; omit the option"
+                )
+            backbone = "paper"
         stage = BACKBONES[backbone](stage)
         fit = stage.fit
         batch = self.batch or fit.batch
@@ -108,6 +114,6 @@ def observer(bars: Bars) -> Callable[[Any], None]:
             text = f"loss {event.loss:.1f}, {100 * event.inlier_share:.0f} % inliers"
             bar.set_postfix_str(text, refresh=event.step == event.total)
         else:
-            bars.step("encoding", event.done, event.total)
+            bars.step(event.name, event.done, event.total)
 
     return show

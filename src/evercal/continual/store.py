@@ -233,8 +233,6 @@ def _read_record(folder: Path) -> SceneRecord:
         side_m=cell["side_m"],
         origin_m=tuple(cell["origin_m"]),
     )
-    # Stores of version 0.1 may hold intrinsics that training estimated.
-    camera = content.pop("refined_camera", None) or content["camera"]
-    content["camera"] = Camera.from_dict(camera)
+    content["camera"] = Camera.from_dict(content["camera"])
     tensors = _tensors(folder / PROTOTYPES)
     return SceneRecord(prototypes=tensors["prototypes"], **content)

@@ -10,9 +10,6 @@ from typing import TypeGuard
 from evercal.classes import frozen
 from evercal.continual.methods.ewc import ElasticWeightConsolidation
 from evercal.continual.methods.gec import EpisodicConstraint
-from evercal.continual.methods.learning_without_forgetting import (
-    LearningWithoutForgetting,
-)
 from evercal.continual.methods.method import FineTuning, Isolation, Method, described
 from evercal.continual.methods.mir import MaximallyInterferedRetrieval
 from evercal.continual.methods.penalties import (
@@ -37,15 +34,6 @@ class Strategy:
     """Method that trains the network; None for a map."""
     jointly: bool = False
     """Whether all scenes are trained at once, as a reference for the others."""
-    source: str = ""
-    """Source of the strategy; by default that of its method."""
-
-    @property
-    def citation(self) -> str:
-        """Source of the strategy."""
-        if self.source or not self.method:
-            return self.source
-        return self.method.citation
 
     def weighted(self, weight: float) -> "Strategy":
         """Copy the strategy with another weight of what protects earlier scenes."""
@@ -81,7 +69,6 @@ _METHODS: dict[str, Method | None] = {
     "co2l": Replay("reservoir", Relations()),
     "gec": EpisodicConstraint(),
     "ewc": ElasticWeightConsolidation(),
-    "lwf": LearningWithoutForgetting(),
     "sars_spdd": Replay("sars", Distillation(), weight=10.0),
     "sars_spdd_filled": Replay("sars_filled", Distillation(), weight=10.0),
     "reservoir_spdd": Replay("reservoir", Distillation(), weight=10.0),
@@ -91,25 +78,8 @@ _METHODS: dict[str, Method | None] = {
     "isolation": Isolation(),
     "joint": FineTuning(),
 }
-_SOURCES = {
-    "evercal": "this project: a map of keyframes and sub-pixel landmarks, nothing trained",
-    "icarl": "Rebuffi et al., iCaRL, CVPR 2017, ported to points",
-    "buff_cs": "Wang et al., Continual Learning for Image-Based Camera Localization, ICCV 2021",
-    "gdr": "Qi et al., FedCBDR's global-perspective data replay, NeurIPS 2025",
-    "gss": "Aljundi et al., Gradient based sample selection, NeurIPS 2019",
-    "co2l": "Cha et al., Co2L's relation distillation, ICCV 2021, ported to points",
-    "sars_spdd": "Li et al., Continual Hand-Eye Calibration, arXiv 2604.15814, Algorithms 1 and 2",
-    "sars_spdd_filled": "the same with a radius that fills the memory",
-    "sars_pixels": "this project: filled SARS with old points in pixels in place of SPDD",
-    "reservoir_spdd": "Li et al., SPDD on a reservoir of frames",
-    "sars_old_output": "Li et al., SARS with the distillation of iCaRL",
-    "sars_reprojection": "Li et al., SARS with reprojection alone",
-    "joint": "all frames of all scenes at once",
-}
-"""Of strategies whose source is not that of their method."""
 STRATEGIES: dict[str, Strategy] = {
-    name: Strategy(name, method, name == "joint", _SOURCES.get(name, ""))
-    for name, method in _METHODS.items()
+    name: Strategy(name, method, name == "joint") for name, method in _METHODS.items()
 }
 
 

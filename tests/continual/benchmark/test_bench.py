@@ -330,3 +330,19 @@ def test_backbone_of_the_paper_gets_all_centres_in_advance(
     first = NetworkStore.open(tmp_path / "runs" / "first-one-0").contents
     assert len(first.heads[0].centres) == 5
     assert first.scenes[0].cell.side_m == 5.0
+
+
+def test_a_map_has_the_memory_of_the_networks(
+    arcs: Arcs, arc_stage: StageOptions, tmp_path: Path
+) -> None:
+    """In bytes, too: a few keyframes of a few kB, and not as many keyframes as bytes."""
+    few_bytes = BenchOptions(
+        lambda seed: arc_stage.with_memory("30kB"),
+        named("evercal"),
+        (0,),
+        short_side=120,
+    )
+    list(run_bench(arcs, few_bytes, tmp_path))
+    results = read(tmp_path)
+    assert (results["frames_kept"] < 18).all()
+    assert results["memory_bytes"].max() < 2 * 30_000 + 20_000

@@ -65,7 +65,7 @@ def test_ablation_changes_one_thing_per_step() -> None:
 
 def test_paper_table_has_scenes_means_and_published_numbers() -> None:
     results = pd.concat([runs(icarl=10, sars_spdd=12), JOINT])
-    paper = paper_table(results, "i12s")
+    paper = paper_table(results, run_scores(results, "i12s"), "i12s")
     ours = ["b", "a", "Mean", "TFR"]
     assert list(paper.index[:4]) == ours
     assert len(paper) == 4 + 12 + 2
@@ -78,12 +78,16 @@ def test_paper_table_has_scenes_means_and_published_numbers() -> None:
     shown = accuracy.loc[[*ours, *paper.index[-2:]]]
     assert shown["sars_spdd"].tolist() == [60.0, 60.0, 60.0, 20.0, 91.8, 8.1]
     assert shown["joint"].isna().tolist() == [False, False, False, True, False, True]
-    assert list(paper_table(results, "real2").index) == ours
+    assert (
+        list(paper_table(results, run_scores(results, "real2"), "real2").index) == ours
+    )
 
 
 def test_simulated_suites_are_judged_at_1_cm_and_stand_beside_the_papers_sim() -> None:
     results = runs(icarl=10).assign(within_1cm_1deg=[12, 6, 6] * 2)
-    simulated = paper_table(results, "sim-mini")["icarl", "Acc, %"]
+    simulated = paper_table(results, run_scores(results, "sim-mini"), "sim-mini")[
+        "icarl", "Acc, %"
+    ]
     assert simulated[["b", "a", "Mean", "TFR"]].tolist() == pytest.approx([30] * 4)
     theirs = ["bedroom", "kitchen", "living", "Mean", "TFR"]
     rows = [f"{name}, published" for name in theirs]
@@ -107,7 +111,7 @@ def test_published_means_are_those_of_their_rows(suite: str, scenes: int) -> Non
 def test_latex_escapes_names_and_marks_missing_numbers() -> None:
     results = pd.concat([runs(sars_spdd=12), JOINT])
     results.loc[results["strategy"] == "joint", "median_mm"] = float("inf")
-    text = latex(paper_table(results, "i7s"))
+    text = latex(paper_table(results, run_scores(results, "i7s"), "i7s"))
     assert r"\multicolumn{3}{c}{sars\_spdd} & \multicolumn{3}{c}{joint}" in text
     assert r"b & 2.0 & 0.6 & 60.0 & inf & 0.6 & 90.0 \\" in text
     assert r"TFR & -- & -- & 20.0 & -- & -- & -- \\" in text

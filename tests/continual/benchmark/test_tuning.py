@@ -41,13 +41,18 @@ def test_trials_are_tabulated(
     ]
     trials = {"weight": (0.5, 1.0, 2.0), "alpha": (4.0, 8.0, 16.0)}
     monkeypatch.setattr(tuning, "TRIALS", trials)
-    monkeypatch.setattr(tuning, "beyond", lambda areas: (7.0,))
+
+    def beyond_trials(areas: pd.Series[float]) -> tuple[float, ...]:
+        assert len(areas) == 3, "weights beyond an end are no trials"
+        return (1 / 7, 7.0)
+
+    monkeypatch.setattr(tuning, "beyond", beyond_trials)
     steps = list(run_tuning(scenes, options, tmp_path))
-    assert len(steps) == 16
+    assert len(steps) == 20
     table = pd.read_csv(tmp_path / TUNED)
     rows = list(table[["method", "value"]].itertuples(index=False, name=None))
-    tried = [("er", w) for w in (0.5, 1.0, 2.0, 7.0)]
-    tried += [("gec", w) for w in (4.0, 7.0, 8.0, 16.0)]
+    tried = [("er", w) for w in (0.142857, 0.5, 1.0, 2.0, 7.0)]
+    tried += [("gec", w) for w in (0.142857, 4.0, 7.0, 8.0, 16.0)]
     assert rows == tried
     assert table["auc_20cm"].to_numpy() == pytest.approx(
         (table["auc_earlier"] + table["auc_newest"]) / 2, abs=0.011
@@ -71,5 +76,5 @@ def test_strategy_without_a_weight_is_refused(
     arcs: Arcs, options: BenchOptions, tmp_path: Path
 ) -> None:
     options = replace(options, strategies=(strategy_named("finetune"),))
-    with pytest.raises(InputError, match="finetune"):
+    with pytest.raises(InputError, match="no strategy to tune"):
         list(run_tuning(arcs, options, tmp_path))

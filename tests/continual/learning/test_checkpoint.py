@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from evercal.continual import strategies
 from evercal.continual.learning import checkpoint
 from evercal.continual.learning.learn import learn, learn_jointly
 from evercal.continual.learning.stage import StageOptions
@@ -17,7 +18,7 @@ from evercal.continual.methods.ewc import ElasticWeightConsolidation
 from evercal.continual.methods.mir import MaximallyInterferedRetrieval
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.scenes import LearnedScenes
-from evercal.continual.strategies import STRATEGIES
+from evercal.continual.strategies import STRATEGIES, load_plugin, strategy_named
 
 from ..stages import EmptyScenes, Rooms, Stages, weights
 
@@ -89,7 +90,9 @@ def test_joint_training_goes_on(
     assert all(torch.equal(mine[key], others[key]) for key in others)
 
 
-@pytest.mark.parametrize("other", ["seed", "options", "method", "frames", "damaged"])
+@pytest.mark.parametrize(
+    "other", ["seed", "options", "method", "frames", "lens", "damaged"]
+)
 def test_checkpoint_of_another_training_is_ignored(
     other: str, first_stages: Stages, rooms: Rooms, quick: StageOptions, tmp_path: Path
 ) -> None:
@@ -108,8 +111,50 @@ def test_checkpoint_of_another_training_is_ignored(
         start = first_stages["ewc"]
     elif other == "frames":
         room = replace(room, train=room.train[1:])
+    elif other == "lens":
+        focal = replace(room.train[0].camera, fx=2 * room.train[0].camera.fx)
+        room = replace(room, train=[replace(f, camera=focal) for f in room.train])
     else:
         file.write_bytes(file.read_bytes()[:1000])
     steps: list[Progress] = []
     learn(start, method, room, quick, stopped_after(-1, steps), tmp_path)
     assert steps[0].step == 1
+
+
+PENALTY = """
+from dataclasses import dataclass
+from evercal.continual.methods.penalties import Reprojection
+from evercal.continual.methods.replay import Replay
+from evercal.continual.strategies import Strategy
+
+@dataclass(frozen=True)
+class Mine(Reprojection):
+    def __call__(self, student, teacher, rows, tau_px):
+        return {} * super().__call__(student, teacher, rows, tau_px)
+
+STRATEGIES = {{"mine": Strategy("mine", Replay(penalty=Mine()))}}
+"""
+
+
+def test_checkpoint_of_another_penalty_is_ignored(
+    first_stages: Stages,
+    rooms: Rooms,
+    quick: StageOptions,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The code of a plugin decides a training, not only that of the method which uses it."""
+    plugin = tmp_path / "plugin.py"
+    first = []
+    for factor in (1, 1, 100):
+        plugin.write_text(PENALTY.format(factor))
+        monkeypatch.setattr(strategies, "STRATEGIES", dict(STRATEGIES))
+        load_plugin(plugin)
+        method = strategy_named("mine").method
+        assert method is not None
+        steps: list[Progress] = []
+        stop = stopped_after(3 + len(first), steps)
+        with pytest.raises(Killed):
+            learn(first_stages["er"], method, rooms[1], quick, stop, tmp_path)
+        first.append(steps[0].step)
+    assert first == [1, 4, 1]

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from evercal.continual.learning.stage import Encoding, StageOptions
+from evercal.continual.learning.stage import Part, StageOptions
 from evercal.continual.localizer import NetworkLocalizer
 from evercal.continual.methods.penalties import Penalty
 from evercal.continual.methods.replay import Replay
@@ -36,7 +36,7 @@ from ..stages import (
 )
 
 NETWORK = STRATEGIES["sars_pixels"]
-SCENE_BY_SCENE = ["sars_pixels", "gec", "mir", "lwf", "isolation"]
+SCENE_BY_SCENE = ["sars_pixels", "gec", "mir", "ewc", "isolation"]
 
 
 def shortest(options: StageOptions) -> StageOptions:
@@ -53,11 +53,11 @@ def posed(frame: Frame) -> SE3:
 def test_events_are_in_order(
     first_stages: Stages, rooms: Rooms, quick: StageOptions
 ) -> None:
-    events: list[Encoding | Progress] = []
+    events: list[Part | Progress] = []
     second_stage(first_stages["sars_pixels"], rooms, quick, events.append)
     kinds = [kind for kind, _ in groupby(type(event) for event in events)]
-    assert kinds == [Encoding, Progress]
-    encodings = [event for event in events if isinstance(event, Encoding)]
+    assert kinds == [Part, Progress]
+    encodings = [event for event in events if isinstance(event, Part)]
     assert [total for total, _ in groupby(event.total for event in encodings)] == [
         60,
         6,

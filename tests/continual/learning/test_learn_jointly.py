@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from evercal.continual.learning.learn import learn_jointly
-from evercal.continual.learning.stage import Encoding, StageOptions
+from evercal.continual.learning.stage import Part, StageOptions
 from evercal.continual.networks.head import Head
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.scenes import LearnedScenes
@@ -23,10 +23,10 @@ def scenes(
     empty_scenes: EmptyScenes, rooms: Rooms, quick: StageOptions
 ) -> LearnedScenes:
     """Three rooms, learned with the steps of three stages."""
-    events: list[Encoding | Progress] = []
+    events: list[Part | Progress] = []
     after = learn_jointly(empty_scenes("joint"), rooms, quick, events.append)
     kinds = [kind for kind, _ in groupby(type(event) for event in events)]
-    assert kinds == [Encoding, Progress]
+    assert kinds == [Part, Progress]
     steps = [event.step for event in events if isinstance(event, Progress)]
     assert steps == list(range(1, 3 * 8 + 1))
     assert after.frames_kept == 0

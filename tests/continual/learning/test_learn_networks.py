@@ -16,7 +16,7 @@ from evercal.continual.learning.learn_networks import (
     NetworkReport,
     learn_networks,
 )
-from evercal.continual.learning.stage import Encoding, StageOptions
+from evercal.continual.learning.stage import Part, StageOptions
 from evercal.continual.networks.trainer import Progress
 from evercal.continual.store import NetworkStore, head_bytes
 from evercal.continual.strategies import STRATEGIES
@@ -77,7 +77,7 @@ def test_reports_describe_the_store(learned: Learned) -> None:
     first, last = learned.reports
     assert first.memory_bytes < last.memory_bytes == contents.memory_bytes
     assert last.head_bytes == head_bytes(contents.heads[0])
-    assert {type(event) for event in learned.events} == {Encoding, Progress}
+    assert {type(event) for event in learned.events} == {Part, Progress}
 
 
 def test_bad_input_is_refused_and_leaves_the_store_unchanged(
@@ -87,6 +87,10 @@ def test_bad_input_is_refused_and_leaves_the_store_unchanged(
     tmp_path: Path,
     tree: Tree,
 ) -> None:
+    def with_head(**change: object) -> StageOptions:
+        head = replace(options.stage.head, **change)  # type: ignore[arg-type]
+        return replace(options.stage, head=head)
+
     before = tree(learned.root)
     gamma = rooms[2]
     gripper = [
@@ -100,14 +104,17 @@ def test_bad_input_is_refused_and_leaves_the_store_unchanged(
         (gamma, {"strategy": STRATEGIES["joint"]}, r"'joint'.*evercal bench"),
         (gamma, {"strategy": STRATEGIES["evercal"]}, r"'evercal'.*scene by scene"),
         (gamma, {"encoder": Path("encoder.onnx")}, "keeps the encoder"),
-        (gamma, {"stage": options.stage.with_memory("auto")}, "memory auto"),
-        (gamma, {"centres": 5}, "`centres` 5: .* made with 3"),
+        (gamma, {"stage": with_head(centres_per_scene=5)}, "`centres`: .* made with"),
+        (gamma, {"stage": with_head(offsets="shared")}, "`offsets`: .* made with"),
+        (gamma, {"stage": with_head(condition="descriptor")}, "`backbone`: .* made"),
         (replace(gamma, train=tuple(gripper)), {}, "only gripper poses"),
         (few, {}, "'gamma': 7 training frames"),
     ):
         with pytest.raises(InputError, match=message):
             learn_networks(learned.root, recording, replace(options, **change))
     assert tree(learned.root) == before
+    with pytest.raises(InputError, match="memory auto"):
+        options.stage.with_memory("auto")
     with pytest.raises(InputError, match="7 training frames"):
         learn_networks(tmp_path / "new", few, options)
     assert not (tmp_path / "new").exists()

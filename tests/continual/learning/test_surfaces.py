@@ -126,4 +126,6 @@ def test_depths_are_shared_by_runs(
     shared_depths(tmp_path / "cache", FRAMES[1:], encoder, SIDE)
     shared_depths(tmp_path / "cache", FRAMES, encoder, 2 * SIDE)
     shared_depths(None, FRAMES, encoder, SIDE)
-    assert calls == [4, 3, 4, 4]
+    other = [replace(frame, image=255 - frame.read_image()) for frame in FRAMES]
+    shared_depths(tmp_path / "cache", other, encoder, SIDE)
+    assert calls == [4, 3, 4, 4, 4]

@@ -16,7 +16,7 @@ one folder: each takes runs that no other has.
 
 import json
 from collections.abc import Generator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 
@@ -151,11 +151,9 @@ def in_order(scenes: Sequence[Recording], order: Order, seed: int) -> list[Recor
 
 
 def _settings(scenes: Sequence[Recording], options: BenchOptions) -> JsonObject:
-    stage = options.stage(0)
-    stage = replace(stage, seed=0, encode=replace(stage.encode, seed=0))
     networks = (ENCODER_FILE, DESCRIBED_ENCODER, DESCRIPTOR_FILE)
     return {
-        **asdict(stage),
+        **asdict(options.stage(0)),
         "networks": [sha256_file(file)[:12] for file in networks],
         "localize": asdict(LocalizeOptions()),
         "localize_networks": asdict(NETWORK_LOCALIZE),

@@ -3,6 +3,7 @@
 The Okabe-Ito colours are distinguishable with colour blindness.
 """
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -113,17 +114,17 @@ def draw_curves(folder: Path) -> bool:
     curves = sorted(folder.glob(f"training/*/{CURVE}"))
     figure = new_figure(9.0, 3.4)
     panels = [figure.add_subplot(1, 2, number) for number in (1, 2)]
-    colours: dict[str, str] = {}
+    numbers: dict[str, int] = {}
     for path in curves:
         curve = pd.read_csv(path)
-        strategy = path.parent.name.partition("-")[0]
-        label = f"_{strategy}"
-        if strategy not in colours:
-            colours[strategy] = COLOURS[len(colours) % len(COLOURS)]
-            label = strategy
+        # Folders are STRATEGY-SEED-SCENE, and names may have hyphens.
+        strategy = re.split(r"-\d+(?:-|$)", path.parent.name)[0]
+        label = f"_{strategy}" if strategy in numbers else strategy
+        again, colour = divmod(numbers.setdefault(strategy, len(numbers)), len(COLOURS))
+        style: JsonObject = {"color": COLOURS[colour], "label": label}
+        dashes = _DASHES[again % len(_DASHES)]
         for panel, column in zip(panels, ("loss", "inlier_share"), strict=True):
-            style: JsonObject = {"color": colours[strategy], "label": label}
-            panel.plot(curve["step"], curve[column], linewidth=0.8, **style)
+            panel.plot(curve["step"], curve[column], dashes, linewidth=0.8, **style)
     for panel, title in zip(panels, ("loss (px)", "inliers (share)"), strict=True):
         panel.set_title(title, fontsize=9)
         panel.set_xlabel("step")

@@ -58,11 +58,11 @@ def published(suite: str) -> Table:
     return rows[rows["suite"] == name].drop(columns="suite")
 
 
-def paper_table(results: Table, suite: str = "") -> Table:
+def paper_table(results: Table, scores: Table, suite: str = "") -> Table:
     """Tabulate median errors and accuracies of complete runs by scene, then mean and TFR.
 
     Values are means over runs, after the last stage. Accuracy and TFR are at the threshold of the
-    suite. The published rows follow if there are any.
+    suite; `scores` are those of the runs. The published rows follow if there are any.
     """
     last = comparison.last_stage(results)
     threshold, _ = comparison.thresholds(suite)
@@ -77,10 +77,8 @@ def paper_table(results: Table, suite: str = "") -> Table:
     table = _side_by_side(means)
     names = list(last["strategy"].unique())
     table = table.reindex(columns=pd.MultiIndex.from_product([names, cells.columns]))
-    by_strategy = comparison.run_scores(results, suite)[comparison.TFR].groupby(
-        "strategy"
-    )
-    forgetting = by_strategy.agg(lambda values: values.mean(skipna=False))
+    rates = scores[comparison.TFR].groupby("strategy")
+    forgetting = rates.agg(lambda values: values.mean(skipna=False))
     totals = {"Mean": table.xs(ACCURACY, axis=1, level=1).mean(), "TFR": forgetting}
     for title, values in totals.items():
         table.loc[title] = nan

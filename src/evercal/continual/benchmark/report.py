@@ -42,15 +42,16 @@ def write_report(folder: Path, reference: str) -> tuple[str, list[JsonObject]]:
     All strategies are compared with `reference`. Returns the tables as Markdown, and the scores of
     each run for JSON; NaN becomes None.
     """
-    results = stored.read(folder)
+    results = comparison.complete_runs(stored.read(folder))
     if results.empty:
-        raise InputError(f"{folder}: no results here; make some with 'evercal bench'")
-    suite = str(read_settings(folder / stored.SETTINGS).get("suite"))
-    results = comparison.complete_runs(results)
+        raise InputError(f"{folder}: no complete run; make one with 'evercal bench'")
+    settings = read_settings(folder / stored.SETTINGS)
+    suite = str(settings.get("suite"))
+    least = comparison.GATES[settings["head"]["condition"]]
     threshold, _ = comparison.thresholds(suite)
     scores = comparison.run_scores(results, suite)
     methods = comparison.method_table(scores)
-    paper = paper_table(results, suite)
+    paper = paper_table(results, scores, suite)
     accuracies = comparison.formatted(paper.xs(ACCURACY, axis=1, level=1))
     ablation = ablation_table(scores, suite)
     others = methods.index.drop(reference, errors="ignore")
@@ -71,7 +72,7 @@ def write_report(folder: Path, reference: str) -> tuple[str, list[JsonObject]]:
         if len(table):
             rows = table.to_markdown(index=False, disable_numparse=True)
             sections.append(f"## {title}\n\n{rows}")
-    text = "\n\n".join([*sections, comparison.gate(scores, suite)])
+    text = "\n\n".join([*sections, comparison.gate(scores, suite, least)])
     figures = f"![final accuracy]({BARS})\n![accuracy over stages]({LINES})"
     if draw_overlays(folder, methods.index):
         figures += f"\n![contours by the estimated poses]({OVERLAYS})"

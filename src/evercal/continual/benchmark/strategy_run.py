@@ -26,7 +26,13 @@ from evercal.continual.learning.learn_networks import (
     NetworkLearnOptions,
     learn_networks,
 )
-from evercal.continual.learning.stage import OnEvent, StageOptions, unobserved
+from evercal.continual.learning.stage import (
+    OnEvent,
+    Part,
+    StageOptions,
+    Watched,
+    unobserved,
+)
 from evercal.continual.learning.stage_rows import StageRows
 from evercal.continual.localizer import NetworkLocalizeOptions, NetworkLocalizer
 from evercal.continual.networks.atlas import combined_centres
@@ -131,7 +137,11 @@ class _Run:
         costs = {**costs, "environment": record_environment(self.out)}
         run = {"strategy": self.strategy.name, "seed": self.stage.seed}
         learned = {scene.name: scene for scene in self.scenes[: number + 1]}
-        evaluated = evaluate(localizer, learned)
+        evaluated = evaluate(
+            localizer,
+            learned,
+            on_frame=lambda done, total: self.on_event(Part("locating", done, total)),
+        )
         last = len(learned) == len(self.scenes)
         for name, scene in learned.items():
             of_scene = [frame for frame in evaluated if frame.scene == name]
@@ -153,7 +163,9 @@ class _MapRun(_Run):
             cache_features(opened.contents.encoder, self.features)
             if number >= len(opened.stages):
                 memory = self.stage.memory
-                size = memory.bytes or f"{100 * memory.share:g}%"
+                size = f"{100 * memory.share:g}%"
+                if memory.bytes:
+                    size = f"{memory.bytes}B"
                 scene, report = learn_scene(self.scenes[number], opened.contents, size)
                 opened.commit(scene, report.to_dict())
             contents = opened.contents
@@ -190,9 +202,10 @@ class _NetworkRun(_Run):
         folder = self.curves / self.store.name
         folder.mkdir(parents=True, exist_ok=True)
         empty = self._prepared(self._new_store().contents)
+        watched = Watched(self.on_event)
         began = perf_counter()
-        learned = learn_jointly(empty, self.scenes, self.stage, self.on_event, folder)
-        seconds = perf_counter() - began
+        learned = learn_jointly(empty, self.scenes, self.stage, watched, folder)
+        seconds = watched.last.earlier_s + perf_counter() - began
         yield self._located(learned, len(self.scenes) - 1, seconds)
         (folder / CHECKPOINT).unlink(missing_ok=True)
 

@@ -16,6 +16,7 @@ from evercal.continual.benchmark.bench import CompletedStage, run_bench
 from evercal.continual.benchmark.results import Table
 from evercal.continual.benchmark.strategy_run import BenchOptions
 from evercal.continual.strategies import Strategy
+from evercal.errors import InputError
 from evercal.recordings import Recording
 from evercal.storage import write_bytes
 
@@ -38,14 +39,16 @@ def run_tuning(
     """
     weights = {}
     for strategy in options.strategies:
-        # Refused here for a strategy without a weight.
-        fields = strategy.weighted(1.0).method
-        assert fields, "only a method has a weight"
-        weights[strategy] = TRIALS[fields.weight_field]
+        if strategy.method and strategy.method.weight_field:
+            weights[strategy] = TRIALS[strategy.method.weight_field]
+    if not weights:
+        raise InputError(
+            "no strategy to tune; give `strategies` with a weight, such as er"
+        )
     yield from run_bench(scenes, replace(options, strategies=_trials(weights)), out)
     table = tuned(out)
-    for strategy in options.strategies:
-        weights[strategy] = beyond(table.loc[strategy.name, "auc_20cm"][:5])
+    for strategy, tried in weights.items():
+        weights[strategy] = beyond(table.loc[strategy.name, "auc_20cm"].reindex(tried))
     yield from run_bench(scenes, replace(options, strategies=_trials(weights)), out)
     write_bytes(out / TUNED, tuned(out).to_csv().encode())
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import inspect
+import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib.metadata import version
@@ -76,7 +77,7 @@ def _resumed(trainer: HeadTrainer, key: str, checkpoint: Path) -> list[Any]:
 
 
 def _key(trainer: HeadTrainer, method: Method) -> str:
-    """Digest of what decides a training: options, code of the method, first weights and rows."""
+    """Digest of what decides a training: options, code of the method, first weights, some rows."""
     decides = [
         version("evercal"),
         torch.__version__,
@@ -84,13 +85,17 @@ def _key(trainer: HeadTrainer, method: Method) -> str:
         trainer.seed,
         method,
     ]
-    with suppress(OSError, TypeError):  # of a method that was typed in
-        decides.append(inspect.getsource(type(method)))
+    for part in (method, trainer.hooks, *vars(method).values()):
+        # Numbers have no source, nor has a method that was typed in.
+        with suppress(OSError, TypeError):
+            decides.append(inspect.getsource(sys.modules[type(part).__module__]))
     key = hashlib.blake2b(repr(decides).encode(), digest_size=16)
     values = list(trainer.head.state_dict().values())
     for buffer in trainer.buffers:
         rows = buffer.draw(_KEY_ROWS, torch.Generator().manual_seed(0))
-        values += [rows.features, rows.descriptor, rows.target.camera_from_atlas]
+        target = rows.target
+        values += [rows.features, rows.descriptor, rows.known, target.pixels]
+        values += [target.camera_from_atlas, target.intrinsics]
     for value in values:
         key.update(value.numpy(force=True))
     return key.hexdigest()

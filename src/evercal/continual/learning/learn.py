@@ -68,7 +68,6 @@ def learn(
         memories=memories,
         states=scenes.method_states,
         replay_rows=options.fit.replay_batch,
-        seed=options.seed,
     )
     hooks = method.begin(start)
     trainer = HeadTrainer(head, [buffer], options.fit, options.seed, hooks)
@@ -135,7 +134,9 @@ def _begun(
     after.heads.append(head)
     buffer = rows.of_scene(local, cell, frames)
     if options.fit.surface_weight > 0:
-        depths = shared_depths(after.cache, frames, after.encoder, after.short_side)
+        depths = shared_depths(
+            after.cache, frames, after.encoder, after.short_side, rows.on_event
+        )
         points = surface_points(buffer, frames, depths, after.encoder.stride)
         buffer.known = points.to(buffer.device)
     return cell, buffer

@@ -12,13 +12,13 @@ from evercal.continual.learning.checkpoint import CHECKPOINT, CURVE
 from evercal.continual.learning.learn import learn
 from evercal.continual.learning.presets import preset, short_side
 from evercal.continual.learning.stage import (
-    Encoding,
     OnEvent,
     StageOptions,
+    Watched,
     unobserved,
 )
 from evercal.continual.networks.device import device_of
-from evercal.continual.networks.trainer import Progress
+from evercal.continual.networks.head import HeadOptions
 from evercal.continual.store import NetworkStore, head_bytes
 from evercal.continual.strategies import STRATEGIES, Strategy
 from evercal.continual.threshold import fit_threshold
@@ -38,6 +38,14 @@ from evercal.recordings.held_out import (
 )
 from evercal.storage.stages import is_store
 from evercal.typing import JsonObject
+
+SHARED = {
+    "condition": "backbone",
+    "offsets": "offsets",
+    "centres_per_scene": "centres",
+}
+"""Fields of `HeadOptions` that all scenes of a store share, with the option that sets them."""
+_USUAL = HeadOptions()
 
 
 @frozen
@@ -70,8 +78,6 @@ class NetworkLearnOptions:
     """Options of the stage."""
     preset: str = "fast"
     """Name of the preset of `stage`, for the working size of a new store and for the report."""
-    centres: int | None = None
-    """Cluster centres of a scene that the store must have been made with; None for any number."""
     encoder: Path | None = None
     """An ONNX file for a new store."""
     device: str = "auto"
@@ -95,10 +101,6 @@ class NetworkLearnOptions:
                 f"strategy {strategy.name!r}: does not train a network scene by scene; use another"
                 " strategy, or compare it with 'evercal bench'"
             )
-        if self.stage.memory.auto:
-            raise InputError(
-                "memory auto: only a map selects its keyframes; give a share or bytes"
-            )
         if not is_store(store):
             side = self.short_side or short_side(self.preset, frames)
             return NetworkStore.create(store, strategy.name, side, self.encoder)
@@ -112,16 +114,19 @@ class NetworkLearnOptions:
                 f"strategy {strategy.name!r}: the store was made with {opened.contents.strategy!r};"
                 " use that one or start a new store"
             )
-        heads = opened.contents.heads
-        if self.centres is None or strategy.method.head_per_scene:
+        if strategy.method.head_per_scene:
             return opened
-        for head in heads[-1:]:
-            count = head.options.centres_per_scene
-            if self.centres != count:
-                raise InputError(
-                    f"`centres` {self.centres}: {store} was made with {count} per scene; leave the"
-                    " option out or start a new store"
-                )
+        for head in opened.contents.heads[-1:]:
+            for name, option in SHARED.items():
+                usual = getattr(_USUAL, name)
+                if getattr(self.stage.head, name) not in (
+                    usual,
+                    getattr(head.options, name),
+                ):
+                    raise InputError(
+                        f"`{option}`: {store} was made with another one; omit the option, or start"
+                        " a new store"
+                    )
         return opened
 
 
@@ -167,20 +172,14 @@ def learn_networks(
         if options.holds_out:
             split = split_held_out(recording.train)
         train = replace(recording, train=split.train)
-        steps: list[Progress] = []
-
-        def observed(event: Encoding | Progress) -> None:
-            if isinstance(event, Progress):
-                steps[:] = [event]
-            on_event(event)
-
-        learned = learn(contents, strategy.method, train, stage, observed, folder)
-        [last] = steps
+        watched = Watched(on_event)
+        learned = learn(contents, strategy.method, train, stage, watched, folder)
+        last = watched.last
         if split.held_out:
             learned.scenes[-1] = fit_threshold(learned, split.held_out)
         report = NetworkReport(
             scene=recording.name,
-            seconds=perf_counter() - began,
+            seconds=last.earlier_s + perf_counter() - began,
             memory_bytes=learned.memory_bytes,
             frames_kept=learned.frames_kept,
             train_frames=len(split.train),

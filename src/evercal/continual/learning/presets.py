@@ -60,8 +60,7 @@ PRESETS: dict[str, StageOptions] = {
 
 def preset(name: str, seed: int = 0) -> StageOptions:
     """Return a preset with a seed for all random draws."""
-    options = PRESETS[name]
-    return replace(options, seed=seed, encode=replace(options.encode, seed=seed))
+    return replace(PRESETS[name], seed=seed)
 
 
 SHORT_SIDE = 240

@@ -7,7 +7,7 @@ from evercal.classes import frozen
 from evercal.continual.networks.buffer import EncodePlan
 from evercal.continual.networks.head import HeadOptions
 from evercal.continual.networks.trainer import FitOptions, Progress
-from evercal.errors import require_numbers
+from evercal.errors import InputError, require_numbers
 from evercal.mapping.memory_budget import MemoryBudget
 from evercal.typing import Triple
 
@@ -37,25 +37,46 @@ class StageOptions:
         """Check the numbers."""
         require_numbers(self, ("replay_views_per_frame",), 1)
         require_numbers(self, ("grid_scenes",), 0)
+        if self.memory.auto:
+            raise InputError(
+                "memory auto: only a map selects its keyframes; give a share or bytes"
+            )
 
-    def with_memory(self, memory: str | int) -> "StageOptions":
-        """The same options with a memory budget such as `10%` or `5MB`."""
+    def with_memory(self, memory: str | None) -> "StageOptions":
+        """The same options with a memory budget, see `MemoryBudget.parse`."""
         return replace(self, memory=MemoryBudget.parse(memory))
 
 
 @dataclass
-class Encoding:
-    """Images are being encoded."""
+class Part:
+    """Work of a stage beside its training."""
 
+    name: str
+    """What is done: depths of frames, encoding of views, or locating test images."""
     done: int
-    """Encoded views."""
+    """Frames, views or images that are done."""
     total: int
-    """Views of all frames."""
+    """All of them."""
 
 
-OnEvent = Callable[[Encoding | Progress], object]
+OnEvent = Callable[[Part | Progress], object]
 """Observer of a stage, for progress bars."""
 
 
-def unobserved(event: Encoding | Progress) -> None:
+class Watched:
+    """Observes a training for another observer, and keeps its last step."""
+
+    last: Progress
+
+    def __init__(self, on_event: OnEvent):
+        self._on_event = on_event
+
+    def __call__(self, event: Part | Progress) -> None:
+        """Keep a step, and pass the event on."""
+        if isinstance(event, Progress):
+            self.last = event
+        self._on_event(event)
+
+
+def unobserved(event: Part | Progress) -> None:
     """Ignore an event."""

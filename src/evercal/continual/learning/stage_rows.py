@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from evercal.classes import frozen
-from evercal.continual.learning.stage import Encoding, OnEvent, StageOptions, unobserved
+from evercal.continual.learning.stage import OnEvent, Part, StageOptions, unobserved
 from evercal.continual.networks.atlas import Cell
 from evercal.continual.networks.buffer import EncodePlan, FeatureBuffer, encode_frames
 from evercal.continual.scenes import LearnedScenes
@@ -51,11 +51,12 @@ class StageRows:
         self, buffer: FeatureBuffer, frames: Sequence[Frame], plan: EncodePlan
     ) -> FeatureBuffer:
         scenes = self.scenes
-        plan = replace(plan, view=replace(plan.view, short_side=scenes.short_side))
+        view = replace(plan.view, short_side=scenes.short_side)
+        plan = replace(plan, view=view, seed=self.options.seed)
         plan = plan.limited(frames, scenes.encoder.stride)
         total = len(frames) * plan.views_per_frame
         for done in encode_frames(
             buffer, frames, plan, scenes.encoder, scenes.descriptor, scenes.cache
         ):
-            self.on_event(Encoding(done, total))
+            self.on_event(Part("encoding", done, total))
         return buffer

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from evercal.continual.learning.stage import OnEvent, Part, unobserved
 from evercal.continual.networks.buffer import FeatureBuffer
 from evercal.continual.networks.feature_cache import cached, encoder_key
 from evercal.features.encoder import Encoder
@@ -28,7 +29,10 @@ _NEAR_M = 0.05
 
 
 def frame_depths(
-    frames: Sequence[Frame], encoder: Encoder, short_side: int
+    frames: Sequence[Frame],
+    encoder: Encoder,
+    short_side: int,
+    on_event: OnEvent = unobserved,
 ) -> list[Array]:
     """Estimate the depth of every cell of every frame by plane sweeps.
 
@@ -46,6 +50,7 @@ def frame_depths(
         inverse, near = prepared.swept(i, SOURCE_VIEWS)
         swept.append(1 / inverse.astype(float))
         sources.append(near)
+        on_event(Part("depths", i + 1, len(prepared)))
     return [_agreed(prepared, i, swept, sources[i]) for i in numbers]
 
 
@@ -80,7 +85,11 @@ def _at_pixels(depths: Array, pixels: Array, stride: int) -> Array:
 
 
 def shared_depths(
-    cache: Path | None, frames: Sequence[Frame], encoder: Encoder, short_side: int
+    cache: Path | None,
+    frames: Sequence[Frame],
+    encoder: Encoder,
+    short_side: int,
+    on_event: OnEvent = unobserved,
 ) -> list[Array]:
     """Estimate the depths of frames, see `frame_depths`, or read those of an earlier run.
 
@@ -89,16 +98,16 @@ def shared_depths(
     """
     sizes = {frame.camera.size for frame in frames}
     if not cache or len(sizes) > 1:
-        return frame_depths(frames, encoder, short_side)
+        return frame_depths(frames, encoder, short_side, on_event)
     key = hashlib.blake2b(digest_size=16)
     poses = stated_poses(frames).matrix()
     for frame, pose in zip(frames, poses, strict=True):
         key.update(f"{frame.name} {frame.camera} {short_side}".encode())
-        key.update(pose.tobytes())
+        key.update(pose.tobytes() + frame.read_image().tobytes())
     key.update(encoder_key(encoder).encode())
 
     def estimated() -> Array:
-        return np.stack(frame_depths(frames, encoder, short_side))
+        return np.stack(frame_depths(frames, encoder, short_side, on_event))
 
     return list(cached(cache / f"depths-{key.hexdigest()}.npy", estimated))
 

@@ -18,7 +18,9 @@ IMAGE_ROWS = 256
 
 @frozen
 class ElasticWeightConsolidation(Method):
-    """The cost is strength / 2 x mean over weights of sum_s I_s (w - w_s)^2.
+    """EWC (Kirkpatrick et al., PNAS 2017).
+
+    The cost is strength / 2 x mean over weights of sum_s I_s (w - w_s)^2.
 
     The importance I_s of a weight for scene s is the diagonal of the empirical Fisher information:
     the mean over images of the squared gradient of an image's mean loss, with a fixed clamp (a
@@ -26,7 +28,6 @@ class ElasticWeightConsolidation(Method):
     append are free.
     """
 
-    citation = "Kirkpatrick et al., PNAS 2017"
     weight_field = "strength"
     strength: float = 1e6
     """Weight of the mean squared change, weighted by importances of mean 1."""

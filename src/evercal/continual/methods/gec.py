@@ -27,7 +27,7 @@ REFERENCE_ROWS = 8192
 
 @frozen
 class EpisodicConstraint(EpisodicMemory):
-    """GEC with several constraints and the references of its appendix.
+    """GEC (Lai et al., NeurIPS 2025), several constraints and the references of its appendix.
 
     With h_t = loss_t - (1 + slack) reference_t, the original requires <v, g_t> >= alpha h_t of a
     gradient v and steps by -eta v. A step u therefore has <g_t, u> <= -alpha eta h_t. A scene whose
@@ -38,7 +38,6 @@ class EpisodicConstraint(EpisodicMemory):
     has no natural size when the learning rate changes in every step.
     """
 
-    citation = "Lai et al., GEC, NeurIPS 2025, several constraints"
     weight_field = "alpha"
     clamp_px: float = 50.0
     """Fixed soft clamp of remembered losses, pixels. A fixed clamp makes losses of different steps

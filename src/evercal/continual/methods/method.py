@@ -36,8 +36,6 @@ class StageStart:
     """States of all earlier scenes in order."""
     replay_rows: int
     """Rows to replay in a step, for all remembered scenes together."""
-    seed: int
-    """Seed of the stage."""
 
 
 @frozen
@@ -64,8 +62,6 @@ class FinishedScene:
 class Method:
     """Base of all methods: trains on the new scene alone and stores nothing."""
 
-    citation: ClassVar[str] = ""
-    """Source of the method, for results."""
     replays: ClassVar[bool] = False
     """Whether training needs the rows of remembered keyframes."""
     head_per_scene: ClassVar[bool] = False
@@ -94,14 +90,11 @@ class Method:
 class FineTuning(Method):
     """Trains on each new scene from the weights after the last one."""
 
-    citation = "control: the same head and steps, no replay"
-
 
 @frozen
 class Isolation(Method):
-    """A head per scene, initialised from the last one; scenes share no weights."""
+    """A head per scene, after ESAC (Brachmann and Rother, ICCV 2019); scenes share no weights."""
 
-    citation = "after ESAC (Brachmann and Rother, ICCV 2019): an expert per scene"
     head_per_scene = True
 
 

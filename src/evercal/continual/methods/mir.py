@@ -22,7 +22,6 @@ class MaximallyInterferedRetrieval(Replay):
     each remembered scene.
     """
 
-    citation = "Aljundi et al., Maximally interfered retrieval, NeurIPS 2019"
     candidates: int = 48
     """Candidate views per scene."""
     chosen: int = 8

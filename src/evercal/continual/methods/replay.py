@@ -64,7 +64,6 @@ class MemoryHooks(TrainingHooks):
 class Replay(EpisodicMemory):
     """Replays keyframes (Chaudhry et al., On tiny episodic memories, 2019)."""
 
-    citation = "Vitter 1985; Chaudhry et al., On tiny episodic memories, 2019"
     weight_field = "weight"
     penalty: Penalty = field(default_factory=Reprojection)
     """Loss of the replayed rows."""

@@ -219,13 +219,12 @@ class EncodePlan:
         return plain + (self.views_per_frame - 1) * self.cells * len(frames)
 
     def limited(self, frames: Sequence[Frame], stride: int) -> "EncodePlan":
-        """The plan for all frames of a training, with fewer rows of a view, then fewer views."""
+        """The plan for all frames of a training: fewer views, and equal numbers of rows of each."""
         if not self.most_rows or self.rows(frames, stride) <= self.most_rows:
             return self
         each = max(1, self.most_rows // len(frames))
-        cells = min(self.cells, each)
-        views = min(self.views_per_frame, each // cells)
-        return replace(self, views_per_frame=views, cells=cells, thinned=True)
+        views = min(self.views_per_frame, max(1, each // self.cells))
+        return replace(self, views_per_frame=views, cells=each // views, thinned=True)
 
 
 def encode_frames(

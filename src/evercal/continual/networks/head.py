@@ -29,7 +29,8 @@ SCALE_MIN = 0.01
 WHITENING = 0.5
 """Strength of the input whitening, from 0 (none) to 1 (fully decorrelated)."""
 NEW_LOGIT = -10.0
-"""Logit of a centre that joins the softmax of earlier scenes, before it is trained."""
+"""Logit of a centre that joins the softmax of earlier scenes, before it is trained, relative to the
+mean bias of these. A softmax depends on differences only."""
 OWNED = ("code", "logit", "logit_bias", "offset", "offset_bias")
 """Parameters whose number of rows depends on the scenes."""
 
@@ -213,7 +214,7 @@ class Head(nn.Module):
         bias = torch.zeros(count)
         if self.options.condition == "descriptor" and len(self.centres):
             logit *= 0
-            bias += NEW_LOGIT
+            bias += self.logit_bias.detach().mean().cpu() + NEW_LOGIT
         self.logit = _append(self.logit, logit)
         self.logit_bias = _append(self.logit_bias, bias)
         if self.options.offsets == "per_centre":

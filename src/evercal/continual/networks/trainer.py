@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from time import perf_counter
 from typing import Any
 
 import torch
@@ -72,6 +73,8 @@ class Progress:
     """(n,) reprojection error of each new row in the last step, pixels."""
     rate: float
     """Learning rate of AdamW in the last step."""
+    earlier_s: float = 0.0
+    """Time of training before a stop, seconds."""
 
     # Properties, because reading a value synchronises with the GPU.
     @property
@@ -105,6 +108,9 @@ class HeadTrainer:
         self.options = options
         self.seed = seed
         self.step = 0
+        self.earlier_s = 0.0
+        """Time of training before a stop, seconds."""
+        self._began = perf_counter()
         self.hooks = hooks or TrainingHooks()
         self._optimisers = _optimisers(head, options)
 
@@ -122,6 +128,7 @@ class HeadTrainer:
         hooks = self.hooks
         return {
             "step": self.step,
+            "seconds": self.earlier_s + perf_counter() - self._began,
             "head": self.head.state_dict(),
             "optimisers": [optimiser.state_dict() for optimiser in self._optimisers],
             "hooks": {name: getattr(hooks, name) for name in hooks.carried},
@@ -130,6 +137,7 @@ class HeadTrainer:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from the state of another trainer."""
         self.step = state["step"]
+        self.earlier_s = state["seconds"]
         self.head.load_state_dict(state["head"])
         for optimiser, values in zip(
             self._optimisers, state["optimisers"], strict=True
@@ -167,7 +175,14 @@ class HeadTrainer:
         loss.backward()
         self._take_step(losses, constraints, rate / options.peak_rate)
         self.step += 1
-        return Progress(self.step, options.iterations, costs.detach(), errors, rate)
+        return Progress(
+            step=self.step,
+            total=options.iterations,
+            costs=costs.detach(),
+            errors_px=errors,
+            rate=rate,
+            earlier_s=self.earlier_s,
+        )
 
     def _rows(self, rate: float) -> tuple[Rows, int]:
         generator = Generator().manual_seed(self.seed * 1_000_003 + self.step)
