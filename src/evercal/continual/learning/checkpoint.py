@@ -87,7 +87,7 @@ def _key(trainer: HeadTrainer, method: Method) -> str:
     ]
     for part in (method, trainer.hooks, *vars(method).values()):
         # Numbers have no source, nor has a method that was typed in.
-        with suppress(OSError, TypeError):
+        with suppress(OSError, TypeError, KeyError):
             decides.append(inspect.getsource(sys.modules[type(part).__module__]))
     key = hashlib.blake2b(repr(decides).encode(), digest_size=16)
     values = list(trainer.head.state_dict().values())
