@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from evercal.continual.methods.method import FineTuning, described
+from evercal.continual.methods.method import FineTuning, Method, described
 from evercal.continual.methods.penalties import Distillation
 from evercal.continual.methods.replay import Replay
 from evercal.continual.selection.selectors import SELECTORS
@@ -49,6 +49,17 @@ def test_description_contains_all_hyper_parameters(strategy: Strategy) -> None:
     assert isinstance(method, dict)
     assert method["kind"] == type(strategy.method).__name__
     assert method.keys() - {"kind"} == {field.name for field in fields(strategy.method)}
+
+
+@dataclass(frozen=True)
+class FromFile(Method):
+    """A method of a plugin with a file."""
+
+    file: Path = Path("weights.npz")
+
+
+def test_a_method_with_a_file_is_described() -> None:
+    assert described(FromFile()) == {"kind": "FromFile", "file": "weights.npz"}
 
 
 def test_sars_spdd_has_the_settings_of_the_paper() -> None:

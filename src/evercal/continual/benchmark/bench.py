@@ -14,7 +14,6 @@ An interrupted run goes on where it was, a minute earlier at most. Several proce
 one folder: each takes runs that no other has.
 """
 
-import json
 from collections.abc import Generator, Sequence
 from dataclasses import asdict
 from itertools import product
@@ -123,7 +122,7 @@ def _record_strategies(out: Path, strategies: Sequence[Strategy]) -> None:
     path = out / results.STRATEGIES
     recorded = results.read_records(path)
     for strategy in strategies:
-        now = json.loads(json.dumps(strategy.description()))
+        now = strategy.description()
         before = recorded.setdefault(strategy.name, now)
         if before != now:
             raise InputError(

@@ -5,6 +5,7 @@ select the keyframes, extend the training of a new scene, and compute what is st
 keyframes.
 """
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import ClassVar, Self
@@ -99,7 +100,7 @@ class Isolation(Method):
 
 
 def described(record: object) -> JsonObject:
-    """Convert a dataclass to plain data: its class name as `kind`, and its fields."""
+    """Convert a dataclass to data of JSON: its class name as `kind`, and its fields."""
     assert is_dataclass(record)
     plain: JsonObject = {"kind": type(record).__name__}
     for field in fields(record):
@@ -107,4 +108,4 @@ def described(record: object) -> JsonObject:
         if is_dataclass(value):
             value = described(value)
         plain[field.name] = value
-    return plain
+    return json.loads(json.dumps(plain, default=str))  # a plugin may have a Path
