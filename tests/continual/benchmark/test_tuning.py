@@ -42,7 +42,7 @@ def test_trials_are_tabulated(
     trials = {"weight": (0.5, 1.0, 2.0), "alpha": (4.0, 8.0, 16.0)}
     monkeypatch.setattr(tuning, "TRIALS", trials)
 
-    def beyond_trials(areas: pd.Series[float]) -> tuple[float, ...]:
+    def beyond_trials(areas: pd.Series) -> tuple[float, ...]:
         assert len(areas) == 3, "weights beyond an end are no trials"
         return (1 / 7, 7.0)
 

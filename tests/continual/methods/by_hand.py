@@ -116,7 +116,7 @@ def stage_start(
 ) -> StageStart:
     """Create the start of a stage."""
     selected: list[MethodState] = [{} for _ in memories] if states is None else states
-    return StageStart(head, teacher, memories, selected, replay_rows, 0)
+    return StageStart(head, teacher, memories, selected, replay_rows)
 
 
 def flat(head: Head) -> Tensor:

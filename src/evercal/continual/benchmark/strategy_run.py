@@ -137,11 +137,11 @@ class _Run:
         costs = {**costs, "environment": record_environment(self.out)}
         run = {"strategy": self.strategy.name, "seed": self.stage.seed}
         learned = {scene.name: scene for scene in self.scenes[: number + 1]}
-        evaluated = evaluate(
-            localizer,
-            learned,
-            on_frame=lambda done, total: self.on_event(Part("locating", done, total)),
-        )
+
+        def located(done: int, total: int) -> None:
+            self.on_event(Part("locating", done, total))
+
+        evaluated = evaluate(localizer, learned, on_frame=located)
         last = len(learned) == len(self.scenes)
         for name, scene in learned.items():
             of_scene = [frame for frame in evaluated if frame.scene == name]
