@@ -380,6 +380,8 @@ TABLES: dict[str, Callable[[], Table]] = {
     "network-checks: unseen rooms, one run": network_tables.summary(
         "networks-c", single=True
     ),
+    "network-checks: 240 pixels": network_tables.summary("networks-d-240", single=True),
+    "network-checks: 480 pixels": network_tables.summary("networks-d", single=True),
     "network-checks: the paper's network": network_tables.summary(
         "networks-paper", single=True
     ),

@@ -17,7 +17,9 @@ _INTERVALS_S = {True: 0.2, False: 10.0}
 _RESUMED = 8
 """If more than this is done at the first report of a step, the step was resumed."""
 _UNITS = {
+    "depths": "frame",
     "encoding": "image",
+    "locating": "image",
     "learning": "scene",
     "mapping": "keyframe",
     "matching": "pair",
