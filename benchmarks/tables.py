@@ -394,8 +394,6 @@ TABLES: dict[str, Callable[[], Table]] = {
         "room,frames,side,metre,axes,reach,deviation", "sars-units"
     ),
     "network-trials: tuning": _tuning("tuned-converged", "sim-tune"),
-    "network-trials: tuning of the paper's head": _tuning(
-        "tuned-paper-head", "sim-tune"
-    ),
+    "network-trials: tuning, head": _tuning("tuned-paper-head", "sim-tune"),
 }
 """Tables by page and title."""
