@@ -118,11 +118,8 @@ class NetworkLearnOptions:
             return opened
         for head in opened.contents.heads[-1:]:
             for name, option in SHARED.items():
-                usual = getattr(_USUAL, name)
-                if getattr(self.stage.head, name) not in (
-                    usual,
-                    getattr(head.options, name),
-                ):
+                accepted = getattr(_USUAL, name), getattr(head.options, name)
+                if getattr(self.stage.head, name) not in accepted:
                     raise InputError(
                         f"`{option}`: {store} was made with another one; omit the option, or start"
                         " a new store"
